@@ -1,0 +1,37 @@
+"""drakerock: simulation-based development of robotic rock loading, built on Drake.
+
+Frames, in Drake's monogram notation (``X_WB`` pose of B in W, ``p_WT`` position, ``V_WB`` spatial velocity,
+``F_B_W`` spatial force on B expressed in W):
+
+- W: world. Origin on the drift floor, on the centreline, under the brow; x along the drift towards the
+  pile, y across, z up.
+- F: front unit of the machine; L: boom; B: bucket, origin on the hinge axis; T: bucket tip, the middle of the
+  lip's edge.
+- R: a rock, origin at its centre of mass. P: the pile's toe.
+
+A batch of rocks takes a plural: ``X_WRs``, ``p_WRs`` (n, 3). SI units and radians everywhere; another unit
+only at an input edge, and then in the name (``_deg``).
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import version as _version
+from typing import Any
+
+__version__ = _version("drakerock")
+
+# Imported on first use, so that `import drakerock` and `drakerock --help` stay fast.
+_LAZY: dict[str, str] = {}
+
+__all__ = ["__version__", *_LAZY]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'drakerock' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,16 @@
+"""Errors that a user can act on."""
+
+
+class InputError(Exception):
+    """Bad input: a YAML key, an SDFormat file, a data file, an option, a folder.
+
+    The message names the file or option, the key, and what is allowed. The command line prints it alone
+    and exits with code 2.
+    """
+
+
+class SimulationFailure(Exception):
+    """The dynamics could not go on (solver failure, a state that is not finite).
+
+    A cycle that raises it is recorded as failed with this message; a campaign goes on.
+    """

@@ -1,0 +1,1 @@
+"""The pile (method section 3): rock shapes and gradation, site, state, filling."""

@@ -1,0 +1,1 @@
+"""The campaign: studies, their store and their runner."""
