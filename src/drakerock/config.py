@@ -73,7 +73,9 @@ def parse_config(
         raise InputError(f"{where}: not valid YAML: {problem}") from None
     data = {} if data is None else data
     if not isinstance(data, dict):
-        raise InputError(f"{source}: expected keys and values at the top level, found a {type(data).__name__}")
+        raise InputError(
+            f"{source}: expected keys and values at the top level, found a {type(data).__name__}"
+        )
     overridden = _apply_overrides(data, overrides)
     try:
         return schema.model_validate(data)
@@ -88,7 +90,9 @@ def _apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[Key
         name, sep, value = item.partition("=")
         path = tuple(name.strip().split("."))
         if not sep or not all(path):
-            raise InputError(f"--set {item}: expected key=value, for example --set loading.strategy.alpha=1.2")
+            raise InputError(
+                f"--set {item}: expected key=value, for example --set loading.strategy.alpha=1.2"
+            )
         try:
             parsed = yaml.safe_load(value)
         except yaml.YAMLError:
