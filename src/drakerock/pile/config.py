@@ -51,7 +51,7 @@ class RocksConfig(Config):
 
 
 class SiteConfig(Config):
-    """The drift and the void behind its brow (method section 3). W's origin is on the floor under the brow."""
+    """The drift and the void behind its brow (method section 3)."""
 
     drift_width: Annotated[float, Field(gt=1, le=30, description="[m]")] = 6.5
     drift_height: Annotated[float, Field(gt=1, le=20, description="at the crown [m]")] = 5.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +78,7 @@ def make_site(config: SiteConfig, n_roof: int = 8) -> Site:
     # The solid reaches past the side walls, so that no seam is open where roof and wall meet.
     edges = np.linspace(-half, half, n_roof + 1)
     pieces = []
-    for k, (y0, y1) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for k, (y0, y1) in enumerate(pairwise(edges)):
         wide0, wide1 = (y0 - (2.0 if k == 0 else 0.0), y1 + (2.0 if k == n_roof - 1 else 0.0))
         corners = []
         for y, wide in ((y0, wide0), (y1, wide1)):

@@ -64,12 +64,12 @@ class PileState:
 
     def select(self, rocks: NDArray[Any]) -> PileState:
         """Return the pile of the rocks chosen by an index or mask array (n,)."""
-        arrays = {name: getattr(self, name)[rocks] for name in _ARRAYS}
+        arrays: dict[str, Any] = {name: getattr(self, name)[rocks] for name in _ARRAYS}
         return replace(self, **arrays)
 
     def join(self, other: PileState) -> PileState:
         """Return the pile of the rocks of both, this one's first; the provenance is this one's."""
-        arrays = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _ARRAYS}
+        arrays: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _ARRAYS}
         return replace(self, **arrays)
 
     def calc_masses(self, shape_volumes: Array, density: float) -> Array:
