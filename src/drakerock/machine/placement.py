@@ -1,0 +1,97 @@
+"""Placing the machine on the floor."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context
+
+from drakerock.errors import InputError
+from drakerock.machine import names
+from drakerock.machine.kinematics import calc_bucket_range, calc_joint_angles, make_kinematics
+from drakerock.machine.model import Machine
+
+
+def set_machine_pose(
+    plant: MultibodyPlant,
+    context: Context,
+    machine: Machine,
+    *,
+    x_tip: float,
+    y: float = 0.0,
+    z_tip: float = 0.0,
+    psi: float = 0.0,
+) -> None:
+    """Put the machine at rest on the floor z = 0, along +x, at its static equilibrium.
+
+    Args:
+        plant: the finalized plant.
+        context: the plant's context; positions and velocities of the machine are written. With a SceneGraph
+            connected the tyres' contact stiffness is read from it, otherwise they are rigid.
+        machine: the machine.
+        x_tip, z_tip: where the bucket's tip is to be [m].
+        y: of the machine's middle [m].
+        psi: pitch of the bucket [rad], nose-up positive.
+
+    Raises:
+        InputError: boom or bucket can't reach that pose.
+    """
+    kin = make_kinematics(plant, machine)
+    instance = machine.instance
+    plant.SetPositions(context, instance, plant.GetDefaultPositions(instance))
+    plant.SetVelocities(context, instance, np.zeros(plant.num_velocities(instance)))
+    front = plant.GetBodyByName("front_unit", instance)
+    tip = plant.GetFrameByName("tip", instance)
+    boom = plant.GetJointByName("boom_joint", instance)
+    bucket = plant.GetJointByName("bucket_joint", instance)
+
+    sink, pitch, z_level, psi_level = 0.0, 0.0, z_tip, psi
+    for _ in range(4):
+        # The chassis' pitch and sink move the tip by millimetres: corrected by iteration.
+        phi_l, phi_b = (float(angle) for angle in calc_joint_angles(kin, z_level, psi_level))
+        low, high = calc_bucket_range(kin, phi_l)
+        if not (kin.phi_l_range[0] <= phi_l <= kin.phi_l_range[1] and low <= phi_b <= high):
+            raise InputError(f"the machine can't reach z_tip = {z_tip:.3f} m with psi = {psi:.3f} rad")
+        boom.set_angle(context, phi_l)
+        bucket.set_angle(context, phi_b)
+        X_WF = RigidTransform(RollPitchYaw(0, pitch, 0), [0, y, kin.wheel_radius - sink])
+        plant.SetFreeBodyPose(context, front, X_WF)
+        p_WT = tip.CalcPoseInWorld(context).translation()
+        plant.SetFreeBodyPose(
+            context, front, RigidTransform(X_WF.rotation(), X_WF.translation() + [x_tip - p_WT[0], 0, 0])
+        )
+        z_level += z_tip - p_WT[2]
+        psi_level = psi + pitch
+        sink, pitch = _calc_equilibrium(plant, context, machine)
+
+
+def _calc_equilibrium(plant: MultibodyPlant, context: Context, machine: Machine) -> tuple[float, float]:
+    """Return how far the front axle sinks [m] and the chassis pitches (about +y) under the axle loads."""
+    instance = machine.instance
+    stiffness = _find_tyre_stiffness(plant, context, machine)
+    if stiffness is None:
+        return 0.0, 0.0
+    x_front, x_rear = (
+        np.mean([plant.GetBodyByName(w, instance).EvalPoseInWorld(context).translation()[0] for w in pair])
+        for pair in (names.WHEELS[:2], names.WHEELS[2:])
+    )
+    x_center = plant.CalcCenterOfMassPositionInWorld(context, [instance])[0]
+    weight = plant.CalcTotalMass(context, [instance]) * -plant.gravity_field().gravity_vector()[2]
+    share = (x_center - x_rear) / (x_front - x_rear)
+    sink_front = share * weight / (2 * stiffness)
+    sink_rear = (1 - share) * weight / (2 * stiffness)
+    return sink_front, float(np.arctan2(sink_front - sink_rear, x_front - x_rear))
+
+
+def _find_tyre_stiffness(plant: MultibodyPlant, context: Context, machine: Machine) -> float | None:
+    port = plant.get_geometry_query_input_port()
+    if not port.HasValue(context):
+        return None
+    inspector = port.Eval(context).inspector()
+    wheel = plant.GetBodyByName(names.WHEELS[0], machine.instance)
+    for geometry in plant.GetCollisionGeometriesForBody(wheel):
+        properties = inspector.GetProximityProperties(geometry)
+        if properties.HasProperty("material", "point_contact_stiffness"):
+            return float(properties.GetProperty("material", "point_contact_stiffness"))
+    return None
