@@ -54,7 +54,7 @@ class NonsmoothConfig(Config):
         float,
         Field(
             gt=0,
-            description="contact stiffness of a rock = factor * elastic modulus * sieve width, in series per pair",
+            description="on Hertz's stiffness of two balls of the rocks' sieve widths, modulus and Poisson ratio",
         ),
     ] = 1.0
     max_recovery_speed: Annotated[

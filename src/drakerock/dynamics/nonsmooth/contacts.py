@@ -27,6 +27,7 @@ FRICTION = 23
 IMPULSE = 24  # 24..26 normal, tangent 1, tangent 2 [N s]
 GAP = 27
 RESTITUTION = 28
+TANGENT_STEP = 29  # 2 / trace of the tangential block
 ROW_WIDTH = 32
 
 # Columns of the memory.

@@ -1,6 +1,6 @@
 """The engine: one step of all rocks, from state arrays to state arrays.
 
-`RockEngine` holds what does not change during a simulation (shapes, masses, the site, settings) and scratch
+`NonsmoothEngine` holds what does not change during a simulation (shapes, masses, the site, settings) and scratch
 memory that never changes a result. All state is in a `RockArrays`, which callers own.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,7 +141,7 @@ def make_machineless_step() -> MachineStep:
     )
 
 
-class RockEngine:
+class NonsmoothEngine:
     """Steps a given set of rocks on a given site, with the pieces of a machine if there is one.
 
     Args:
@@ -214,8 +214,10 @@ class RockEngine:
         inverse = inertia[self.shape_index] / (rocks.density * self.size**5)[:, None, None]
         self.inverse_inertia_local = np.ascontiguousarray(inverse.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
         self.radius = self.size * self.convex.radius[self.shape_index]
-        self.compliance = np.zeros(n + 1 + n_machine_bodies)
-        self.compliance[:n] = 1.0 / (config.stiffness_factor * rocks.elastic_modulus * self.size)
+        self.curvature = np.zeros(n + 1 + n_machine_bodies)
+        self.curvature[:n] = 2.0 / self.size
+        effective_modulus = 0.5 * rocks.elastic_modulus / (1.0 - rocks.poisson_ratio**2)
+        self.hertz = config.stiffness_factor * 4.0 / 3.0 * effective_modulus
 
         self._lower_site, self._upper_site = _calc_site_box(site)
         self._grids = _make_grid_classes(self.radius)
@@ -349,7 +351,30 @@ class RockEngine:
         outside = (positions < self._lower_site) | (positions > self._upper_site)
         return np.asarray(outside.any(axis=1))
 
+    def place(self, arrays: RockArrays, rocks: IntArray, p_WRs: Array, V_WRs: Array) -> RockArrays:
+        """Return the state with rocks put at positions (m, 3) with velocities (m, 6), awake."""
+        new = replace(
+            arrays,
+            positions=arrays.positions.copy(),
+            velocities=arrays.velocities.copy(),
+            book=arrays.book.copy(),
+        )
+        new.positions[rocks] = p_WRs
+        new.velocities[rocks] = V_WRs
+        for rock in rocks:
+            reduction.wake_rock(new.book, new.positions, rock)
+        return new
+
     # ---- the step
+
+    @property
+    def time_step(self) -> float:
+        """Time step [s]."""
+        return self.config.time_step
+
+    def advance(self, arrays: RockArrays) -> tuple[RockArrays, StepReport]:
+        """Step without a machine; see `step`."""
+        return self.step(arrays, make_machineless_step())
 
     def step(self, arrays: RockArrays, machine: MachineStep) -> tuple[RockArrays, StepReport]:
         """Advance all rocks by one time step, solved together with the machine.
@@ -411,7 +436,7 @@ class RockEngine:
         machine.arrays.row_values[:, solver.ROW_IMPULSE] = 0.0
         upsilon = 1.0 / (1.0 + 4.0 * config.damping_time)
         solver.prepare_rows(
-            rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, self.compliance,
+            rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, self.curvature, self.hertz,
             dt, upsilon, config.max_recovery_speed, config.impact_threshold,
         )  # fmt: skip
         n_impacts = 0

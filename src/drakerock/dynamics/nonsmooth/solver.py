@@ -31,6 +31,7 @@ from drakerock.dynamics.nonsmooth.contacts import (
     TANGENT_1,
     TANGENT_2,
     TANGENT_MASS,
+    TANGENT_STEP,
 )
 
 # Columns of a body of the solve.
@@ -49,6 +50,9 @@ ROW_MASS = 4
 ROW_IMPULSE = 5
 NORMAL_ROW = 6
 MACHINE_ROW_WIDTH = 7
+
+# Below this overlap the contact stiffness is constant [m].
+MIN_OVERLAP = 1e-5
 
 # Sweeps over the machine's own few, stiffly coupled rows per sweep over the contacts.
 MACHINE_SWEEPS = 4
@@ -198,7 +202,7 @@ def _relative_velocity_machine(row, body_a, machine, velocity, b):
 
 @kernel
 def prepare_rows(
-    rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity, pair_compliance,
+    rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity, curvature, hertz,
     time_step, upsilon, max_recovery_speed, impact_threshold,
 ):  # fmt: skip
     """Set the solver's columns of the contact rows.
@@ -208,10 +212,11 @@ def prepare_rows(
         bodies: (n_rocks + 1, BODY_WIDTH) rocks and, last, all that stands still; velocities before the step.
         n_rocks: B beyond it is body ``b - n_rocks - 1`` of the machine.
         machine, velocity: the machine and its generalised velocities before the step.
-        pair_compliance: (bodies of the solve,) compliance of each body [m/N].
+        curvature: (bodies of the solve,) 1 / radius of a rock, 0 for all else [1/m].
+        hertz: 4/3 E*, E* the pair's effective modulus [Pa]: force = hertz sqrt(radius) overlap^(3/2).
         time_step: [s]; upsilon: 1 / (1 + 4 tau / dt).
         max_recovery_speed: at which overlaps are pushed apart at most [m/s].
-        impact_threshold: what approaches faster is an impact, of which no speed is kept [m/s].
+        impact_threshold: what approaches faster is an impact [m/s].
     """
     mobility = np.zeros(6)
     scratch = np.zeros(len(velocity))
@@ -235,15 +240,19 @@ def prepare_rows(
         m12 = _quadratic(mobility, tx, ty, tz, ux, uy, uz)
         m22 = _quadratic(mobility, ux, uy, uz, ux, uy, uz)
         gap = row[GAP]
+        compliance = 0.0
         if gap > 0.0:
             # apart: they may approach until they touch at the end of the step
-            compliance = 0.0
             bias = -gap / time_step
         else:
-            compliance = 4.0 * upsilon * (pair_compliance[a] + pair_compliance[b]) / (time_step * time_step)
+            bias = min(-4.0 * upsilon * (2.0 / 3.0) * gap / time_step, max_recovery_speed)
             approach = nx * dx + ny * dy + nz * dz
-            bias = min(-4.0 * upsilon * gap / time_step, max_recovery_speed)
-            if approach > -impact_threshold:
+            # An impact without restitution is rigid, and none of its speed is kept.
+            if approach >= -impact_threshold:
+                # Hertz's force, linear about this overlap: a spring of stiffness k stretched by 2/3 of it
+                overlap = max(-gap, MIN_OVERLAP)
+                stiffness = 1.5 * hertz * math.sqrt(overlap / (curvature[a] + curvature[b]))
+                compliance = 4.0 * upsilon / (stiffness * time_step * time_step)
                 bias += upsilon * min(approach, 0.0)
         diagonal = _quadratic(mobility, nx, ny, nz, nx, ny, nz) + compliance
         determinant = m11 * m22 - m12 * m12
@@ -255,6 +264,7 @@ def prepare_rows(
         row[TANGENT_MASS] = m22 * inverse
         row[TANGENT_MASS + 1] = -m12 * inverse
         row[TANGENT_MASS + 2] = m11 * inverse
+        row[TANGENT_STEP] = 2.0 / (m11 + m22) if determinant > 0.0 else 0.0
         row[BIAS] = bias
         row[COMPLIANCE] = compliance
         limit = row[FRICTION] * row[IMPULSE]
@@ -285,9 +295,14 @@ def _solve_row(row, dx, dy, dz):
     limit = row[FRICTION] * new
     size2 = new_1 * new_1 + new_2 * new_2
     if size2 > limit * limit:
-        factor = limit / math.sqrt(size2)
-        new_1 *= factor
-        new_2 *= factor
+        # It slides: against the slip. A step with the matrix would turn the force away from that direction.
+        new_1 = old_1 - row[TANGENT_STEP] * slip_1
+        new_2 = old_2 - row[TANGENT_STEP] * slip_2
+        size2 = new_1 * new_1 + new_2 * new_2
+        if size2 > limit * limit:
+            factor = limit / math.sqrt(size2)
+            new_1 *= factor
+            new_2 *= factor
     row[IMPULSE], row[IMPULSE + 1], row[IMPULSE + 2] = new, new_1, new_2
     new_1 -= old_1
     new_2 -= old_2

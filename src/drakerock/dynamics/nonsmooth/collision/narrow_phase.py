@@ -47,6 +47,8 @@ from drakerock.dynamics.nonsmooth.contacts import (
 
 # A pair that overlaps deeply may turn its normal from the direction it was pushed in by at most 60 degrees.
 MIN_COSINE_TO_HISTORY = 0.5
+# A way per step from which on all corners of a rock count against plates and other solid pieces [m].
+FAST = 0.03
 
 
 @kernel
@@ -75,6 +77,28 @@ def _find_plane_points(shapes, shape, scale, r, x, y, z, plane, max_gap, points,
     for d in range(4):
         points[0, d] = candidates[deepest, d]
     return add_spread_points(candidates, n_candidates, points, 1, 0.2 * scale * shapes.radius[shape])
+
+
+@kernel
+def _add_fast_points(shapes, shape, scale, r, nx, ny, nz, offset, max_gap, points, n_points, candidates):
+    """Add the corners of a fast rock that can reach the plane ``n p = offset`` of what it is about to hit.
+
+    A rock that strikes with one corner would be spun through a thin plate within the step; with rows for its
+    other corners it lands on them.
+    """
+    rounding = scale * shapes.rounding[shape]
+    n_candidates = 0
+    for k in range(shapes.vertex_start[shape], shapes.vertex_start[shape + 1]):
+        cx, cy, cz = get_corner(shapes, k, scale, r)
+        gap = offset - rounding - (nx * cx + ny * cy + nz * cz)
+        if gap < max_gap and n_candidates < len(candidates):
+            shift = rounding + 0.5 * gap
+            candidates[n_candidates, 0] = cx + shift * nx
+            candidates[n_candidates, 1] = cy + shift * ny
+            candidates[n_candidates, 2] = cz + shift * nz
+            candidates[n_candidates, 3] = gap
+            n_candidates += 1
+    return add_spread_points(candidates, n_candidates, points, n_points, 0.2 * scale * shapes.radius[shape])
 
 
 @kernel
@@ -208,6 +232,12 @@ def find_contacts(
                 shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, nx, ny, nz,
                 max(manifold_gap, gap), face_cosine, points, manifold_workspace,
             )  # fmt: skip
+            if b >= n_rocks and time_step * reach > FAST:
+                offset = nx * ax + ny * ay + nz * az + distance - scale_b * shapes.rounding[shape_b]
+                n_points = _add_fast_points(
+                    shapes, shape_a, scale_a, r_a, nx, ny, nz, offset, max_gap, points, n_points,
+                    manifold_workspace[2],
+                )  # fmt: skip
         tx, ty, tz, ux, uy, uz = make_tangents(nx, ny, nz)
         mu = 2.0 * friction[a] * friction[b] / (friction[a] + friction[b])
         match_limit = 0.3 * scale_a * shapes.radius[shape_a]

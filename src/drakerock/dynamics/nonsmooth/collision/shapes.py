@@ -1,8 +1,8 @@
 """Convex shapes as flat arrays: cores with a rounding, their faces and their edges.
 
-A shape is the Minkowski sum of a polyhedral *core* and a ball. The core is the given convex hull, shrunk
-about its centre until the ball's radius fits between core and hull (on the average of the faces). Cores of
-touching rocks are apart, so that distance and normal are well conditioned.
+A shape is the Minkowski sum of a polyhedral *core* and a ball. The core is the given convex hull with its
+faces moved inwards by the ball's radius, so that flat faces stay where they are and only edges and corners are
+rounded. Cores of touching rocks are apart, so that distance and normal are well conditioned.
 """
 
 from __future__ import annotations
@@ -16,6 +16,9 @@ from scipy.spatial import ConvexHull
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+# How far a corner moves inwards at most [roundings].
+MAX_INSET = 4.0
 
 
 class ConvexShapes(NamedTuple):
@@ -86,36 +89,48 @@ def make_convex_shapes(vertices: Sequence[Array], roundings: Sequence[float]) ->
 
 def _make_core(points: Array, rounding: float) -> tuple[Array, list[IntArray], Array]:
     """Return the core's corners, its faces as lists of corners, and the faces' normals."""
+    corners, faces, normals = _find_faces(points)
+    if rounding == 0.0:
+        return corners, faces, normals
+    # Every corner moves inwards until the planes that meet there have moved by the rounding. Where more than
+    # three meet this holds in the mean (least squares), so that no corner has to be split.
+    core = corners.copy()
+    for k, corner in enumerate(corners):
+        planes = normals[[k in face for face in faces]]
+        inset = np.linalg.lstsq(planes, np.full(len(planes), -rounding), rcond=1e-3)[0]
+        # a needle's tip would run away
+        core[k] = corner + inset * min(1.0, MAX_INSET * rounding / np.linalg.norm(inset))
+    offsets = np.array([normal @ corners[face[0]] for normal, face in zip(normals, faces, strict=True)])
+    if not ((normals @ core.mean(axis=0)) < offsets - rounding).all():
+        raise ValueError(f"a rounding of {rounding:g} leaves no core")
+    return _find_faces(core)
+
+
+def _find_faces(points: Array) -> tuple[Array, list[IntArray], Array]:
+    """Return the corners of a convex hull, its faces as lists of corners, and the faces' normals."""
     size = float(np.ptp(points, axis=0).max())
     try:
         hull = ConvexHull(points)
     except Exception as error:  # qhull has its own exception type
         raise ValueError(f"the points span no volume: {error}") from None
-    corners = np.sort(hull.vertices)
-    core = points[corners]
-    index = {int(corner): k for k, corner in enumerate(corners)}
+    chosen = np.sort(hull.vertices)
+    corners = points[chosen]
+    index = {int(corner): k for k, corner in enumerate(chosen)}
     # Triangles of one plane make one face, so that its outline is known for clipping.
     groups: list[tuple[Array, set[int]]] = []
     for simplex, equation in zip(hull.simplices, hull.equations, strict=True):
-        for normal, members in groups:
-            if np.abs(normal - equation).max() < 1e-6 * max(1.0, size):
+        for equation_0, members in groups:
+            if np.abs(equation_0 - equation).max() < 1e-6 * max(1.0, size):
                 members.update(index[int(corner)] for corner in simplex)
                 break
         else:
             groups.append((equation, {index[int(corner)] for corner in simplex}))
     normals = np.array([equation[:3] for equation, _ in groups])
-    offsets = np.array([-equation[3] for equation, _ in groups])
     faces = [
-        _order_outline(core, np.array(sorted(members)), normal)
+        _order_outline(corners, np.array(sorted(members)), normal)
         for (_, members), normal in zip(groups, normals, strict=True)
     ]
-    centre = core.mean(axis=0)
-    if rounding > 0.0:
-        shrink = rounding / float((offsets - normals @ centre).mean())
-        if shrink >= 0.9:
-            raise ValueError(f"a rounding of {rounding:g} leaves no core")
-        core = centre + (1.0 - shrink) * (core - centre)
-    return core, faces, normals
+    return corners, faces, normals
 
 
 def _order_outline(points: Array, members: IntArray, normal: Array) -> IntArray:
