@@ -43,6 +43,9 @@ class PlanningConfig(Config):
     stop_margin: Annotated[
         float, Field(ge=0, le=0.3, description="full tilt is planned this far inside the joint stop [rad]")
     ] = 0.02
+    floor_clearance: Annotated[
+        float, Field(ge=0, le=0.5, description="tip above the floor while it is lowered [m]")
+    ] = 0.03
     run_up: Annotated[float, Field(gt=0, le=30, description="tip to s0 when the loading starts [m]")] = 1.5
     n_segment: Annotated[int, Field(ge=10, le=2000, description="path points a segment")] = 60
 

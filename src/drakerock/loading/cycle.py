@@ -17,7 +17,7 @@ from pydrake.systems.analysis import InitializeParams, Simulator
 import drakerock
 from drakerock.config import calc_config_hash
 from drakerock.errors import InputError, SimulationFailure
-from drakerock.loading.control import ENTERED, MODE, TIMEOUTS, WAYPOINT_TIMES, Mode
+from drakerock.loading.control import ENTERED, TIMEOUTS, WAYPOINT_TIMES, Mode
 from drakerock.loading.field import HeightField
 from drakerock.loading.performance import calc_damage, find_bucket_load, find_debris, find_events
 from drakerock.loading.plan import DigPlan, NoPlan
@@ -44,7 +44,8 @@ class CycleOutcome:
         phi1, phi2, phi3: minus production [kg/s], damage, debris [kg]; all minimised.
         strategy: alpha, beta, gamma, kappa.
         bucket_mass_kg, bucket_rocks: the load at t4.
-        weighed_mass_kg: the load by the machine's weight on the floor at t4, as a cross-check.
+        weighed_mass_kg: the machine's weight on the floor as it stands after t4, less its own: what rocks it
+            carries, a cross-check of the load.
         loading_time_s: t4 - t0.
         waypoint_times_s: t0 to t4; null where not passed.
         plan: swept and wanted volume, whether the wanted one could be reached, entry point, slope, dig height.
@@ -155,6 +156,7 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
     rock_port = station.diagram.GetOutputPort("rock_poses")
     frame_time = 1.0 / scenario.recording.frame_rate
     failure, ended_at = None, None
+    floor_forces: list[float] = []
 
     def record() -> Mode:
         mode = Mode(int(mode_port.Eval(root)[0]))
@@ -190,6 +192,9 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
                 if np.percentile(moved, 99) < config.performance.rest_speed * window:
                     break
                 last_check, last_poses = time, poses
+            # The first half second is left out of the weighing: the machine brakes and rocks.
+            if time - ended_at > 0.5:
+                floor_forces.append(_calc_floor_force(station, plant_context))
             if time - ended_at >= config.performance.settle_time:
                 break
     except (RuntimeError, SimulationFailure) as error:
@@ -205,8 +210,13 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
     else:
         held, debris = in_bucket, np.zeros(len(pile), bool)
 
+    weighed = None
+    if floor_forces:
+        gravity = float(-station.plant.gravity_field().gravity_vector()[2])
+        own = station.plant.CalcTotalMass(plant_context, [station.machine.instance])
+        weighed = float(np.mean(floor_forces)) / gravity - own
     outcome = _make_outcome(
-        scenario, station, pile_at_end, plan, controller, signals, in_bucket, debris, failure,
+        scenario, station, pile_at_end, plan, controller, signals, in_bucket, debris, weighed, failure,
         wall_time=clock.perf_counter() - start,
     )  # fmt: skip
     recording = recorder.finish(
@@ -286,16 +296,29 @@ def write_text(path: Path, text: str) -> None:
 
 def _place(station: Station, root: Any, x_tip: float, y: float) -> None:
     context = station.plant.GetMyMutableContextFromRoot(root)
-    set_machine_pose(station.plant, context, station.machine, x_tip=x_tip, y=y)
+    z_tip = station.scenario.loading.planning.floor_clearance
+    set_machine_pose(station.plant, context, station.machine, x_tip=x_tip, y=y, z_tip=z_tip)
 
 
-def _weigh(signals: dict[str, Array], ended_at: float) -> float | None:
-    """Return the load by the rocks' mean vertical force on the standing bucket [kg]; None if it had no time."""
-    # The first second is left out: the machine brakes and the load settles.
-    standing = signals["time"] >= ended_at + 1.0
-    if not np.any(standing):
-        return None
-    return float(-np.mean(signals["bucket_force_z"][standing]) / 9.81)
+def _calc_floor_force(station: Station, plant_context: Any) -> float:
+    """Return the site's vertical force on the machine at this instant [N]."""
+    plant = station.plant
+    ground = frozenset(plant.GetCollisionGeometriesForBody(plant.world_body()))
+    own = frozenset(
+        geometry
+        for index in plant.GetBodyIndices(station.machine.instance)
+        for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(index))
+    )
+    results = plant.get_contact_results_output_port().Eval(plant_context)
+    total = 0.0
+    for k in range(results.num_point_pair_contacts()):
+        info = results.point_pair_contact_info(k)
+        pair = info.point_pair()
+        if pair.id_B in own and pair.id_A in ground:
+            total += float(info.contact_force()[2])
+        elif pair.id_A in own and pair.id_B in ground:
+            total -= float(info.contact_force()[2])
+    return total
 
 
 def _make_outcome(
@@ -307,6 +330,7 @@ def _make_outcome(
     signals: dict[str, Array],
     in_bucket: NDArray[np.bool_],
     debris: NDArray[np.bool_],
+    weighed: float | None,
     failure: str | None,
     wall_time: float,
 ) -> CycleOutcome:
@@ -314,7 +338,6 @@ def _make_outcome(
     masses = pile.calc_masses(volumes, scenario.rocks.density)
     times = controller[WAYPOINT_TIMES]
     time = signals["time"]
-    mode = Mode(int(controller[MODE]))
     load = float(masses[in_bucket].sum())
     phi: tuple[float, float, float] | None = None
     loading_time = None
@@ -361,7 +384,7 @@ def _make_outcome(
         strategy=scenario.loading.strategy.model_dump(),
         bucket_mass_kg=load if phi else None,
         bucket_rocks=int(in_bucket.sum()) if phi else None,
-        weighed_mass_kg=_weigh(signals, float(controller[ENTERED])) if mode == Mode.DONE and phi else None,
+        weighed_mass_kg=weighed,
         loading_time_s=loading_time,
         waypoint_times_s=[float(t) if np.isfinite(t) else None for t in times],
         plan=planned,

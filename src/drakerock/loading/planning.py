@@ -173,16 +173,18 @@ def make_dig_plan(
     near = np.isfinite(profile.slope) & (np.abs(profile.y - y) <= 0.5 * width)
     slope = float(np.mean(profile.slope[near]))
     x_s0 = float(np.min(profile.x_front[near])) - 0.5 * field.cell
-    h_s2 = strategy.beta * config.r_ft * np.sin(slope)
+    h_s2 = float(strategy.beta * config.r_ft * np.sin(slope))
 
-    dig, psi_m, tables = _plan_dig(strategy.kappa, h_s2, slope, kin, config, speed_floor)
+    # The tip enters at the clearance above the floor, so that much less is left to lift.
+    lift_height = max(h_s2 - config.floor_clearance, 0.0)
+    dig, psi_m, tables = _plan_dig(strategy.kappa, lift_height, slope, kin, config, speed_floor)
     outline = machine.calc_outline()
     swept_dig = sweep_profile(outline, dig.x, dig.z, dig.psi)
 
     def calc_swept(depth: float) -> shapely.Geometry:
         push = sweep_profile(outline, np.array([0.0, depth]), np.zeros(2), np.zeros(2))
         moved = shapely.affinity.translate(swept_dig, depth, 0.0)
-        return shapely.affinity.translate(shapely.union(push, moved), x_s0, 0.0)
+        return shapely.affinity.translate(shapely.union(push, moved), x_s0, config.floor_clearance)
 
     wanted = strategy.alpha * calc_heaped_capacity(machine.bucket)
     depth_max = max(0.0, field.x_end - x_s0 - float(np.max(dig.x)))
@@ -218,7 +220,7 @@ def _plan_dig(
     kappa: float, h_s2: float, slope: float, kin: Kinematics, config: PlanningConfig, floor: float
 ) -> tuple[_Path, float, _Tables]:
     """Integrate the joints from s1 to s3, the tip starting at x = z = 0; full tilt found by iteration."""
-    phi_l, phi_b = (float(angle) for angle in calc_joint_angles(kin, 0.0, 0.0))
+    phi_l, phi_b = (float(angle) for angle in calc_joint_angles(kin, config.floor_clearance, 0.0))
     psi_m = float(calc_full_tilt(kin, phi_l)) - config.stop_margin
     if h_s2 <= 0.0:
         lift = _Path(*(np.array([value]) for value in (0.0, 0.0, 0.0, phi_l, phi_b, 0.0)))
@@ -330,7 +332,7 @@ def _assemble(
     t_s3 = t_s1 + dig.t[-1]
     t_s4 = t_s3 + abs(x_s3 - x_s4) / config.v_x_max
     x = np.concatenate([x_s0 + u * depth, x_s1 + dig.x[1:], (x_s3 + u * (x_s4 - x_s3))[1:]])
-    z = np.concatenate([np.zeros(n + 1), dig.z[1:], np.full(n, dig.z[-1])])
+    z = np.concatenate([np.zeros(n + 1), dig.z[1:], np.full(n, dig.z[-1])]) + config.floor_clearance
     psi = np.concatenate([np.zeros(n + 1), dig.psi[1:], np.full(n, dig.psi[-1])])
     phi_l = np.concatenate([np.full(n + 1, dig.phi_l[0]), dig.phi_l[1:], np.full(n, dig.phi_l[-1])])
     phi_b = np.concatenate([np.full(n + 1, dig.phi_b[0]), dig.phi_b[1:], np.full(n, dig.phi_b[-1])])
@@ -358,7 +360,7 @@ def _assemble(
         t=t,
         segment=segment,
         v_x=SpeedTable(tables.v_x.at + x_s1, tables.v_x.speed),
-        v_z=tables.v_z,
+        v_z=SpeedTable(tables.v_z.at + config.floor_clearance, tables.v_z.speed),
         omega=tables.omega,
         drive_speed=config.v_x_max,
         tilt_rate=config.tilt_rate,

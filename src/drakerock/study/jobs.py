@@ -1,13 +1,19 @@
-"""The main job: a scenario in, a folder with one loading cycle out."""
+"""Single jobs: a scenario in; a folder with a pile, or with one loading cycle, out."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from drakerock.dynamics.settling import PileRecipe, get_pile
-from drakerock.loading.cycle import CycleOutcome, make_folder, run_cycle, save_cycle
+from drakerock.loading.cycle import CycleOutcome, make_folder, run_cycle, save_cycle, write_text
 from drakerock.loading.scenario import Scenario
+from drakerock.pile.shapes import load_rock_shapes
+from drakerock.pile.state import save_pile
+from drakerock.pile.summary import calc_summary
+from drakerock.viewing.pile_figures import write_pile_picture
 from drakerock.viewing.replay import write_replay
 
 
@@ -47,3 +53,26 @@ def run_and_save(
         write_replay(result.recording, folder / "replay.html")
         paths.append(folder / "replay.html")
     return result.outcome, paths
+
+
+def make_pile_files(
+    scenario: Scenario, folder: Path, progress: Callable[..., None]
+) -> tuple[dict[str, Any], list[Path]]:
+    """Make or fetch the scenario's pile and write pile.npz, pile.json and pile.png.
+
+    Returns:
+        The summary, and the paths written.
+
+    Raises:
+        InputError: bad configuration, or the folder cannot be written.
+        SimulationFailure: the pile could not be made.
+    """
+    make_folder(folder)
+    pile, source = get_pile(make_recipe(scenario), progress)
+    shapes = load_rock_shapes(scenario.rocks.shapes)
+    summary = calc_summary(pile, shapes, scenario.rocks) | {"taken_from": str(source)}
+    paths = [folder / "pile.npz", folder / "pile.json", folder / "pile.png"]
+    save_pile(pile, paths[0])
+    write_text(paths[1], json.dumps(summary | {"provenance": pile.provenance}, indent=2) + "\n")
+    write_pile_picture(pile, shapes, scenario.site, paths[2])
+    return summary, paths

@@ -10,12 +10,10 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Meshcat, MeshcatAnimation, MeshcatParams, Rgba
 from pydrake.math import RigidTransform
 from scipy.spatial.transform import Rotation
-from trimesh.convex import convex_hull
 
 from drakerock.errors import InputError
 from drakerock.loading.recording import Recording
 from drakerock.pile.config import SiteConfig
-from drakerock.pile.site import make_site
 
 Array = NDArray[np.float64]
 
@@ -123,20 +121,20 @@ def _draw_site(meshcat: Meshcat, site: SiteConfig, x_start: float) -> None:
     ):
         # Both sides, so that a wall shows from wherever the camera is turned to.
         meshcat.SetTriangleMesh(f"site/{name}", corners.T, np.vstack([quads, quads[:, ::-1]]).T, rgba)
-    for piece in make_site(site).pieces:
-        corners = piece.vertices.copy()
-        corners[:, 0] = np.maximum(corners[:, 0], x_start)
-        corners[:, 1] = np.clip(corners[:, 1], -half, half)
-        _draw_hull(meshcat, f"site/{piece.name}", corners, Rgba(0.4, 0.39, 0.38, 0.12))
-    meshcat.SetProperty("/Background", "top_color", [0.93, 0.94, 0.96])
-    meshcat.SetProperty("/Background", "bottom_color", [0.75, 0.76, 0.78])
-    meshcat.SetProperty("/Grid", "visible", False)
-    meshcat.SetProperty("/Axes", "visible", False)
-
-
-def _draw_hull(meshcat: Meshcat, path: str, corners: Array, rgba: Rgba) -> None:
-    hull = convex_hull(corners)
-    meshcat.SetTriangleMesh(path, np.asarray(hull.vertices).T, np.asarray(hull.faces).T, rgba)
+    lean = np.tan(np.deg2rad(site.wall_lean_deg)) * (site.void_height - height)
+    brow = np.array([[x_start, half, height], [0, half, height], [-lean, half, site.void_height]], float)
+    outline = np.vstack([brow, brow[::-1] * [1, -1, 1]])
+    meshcat.SetLine("site/brow", outline.T, 2.0, Rgba(0.2, 0.2, 0.2))
+    meshcat.SetProperty("/Background/<object>", "top_color", [0.93, 0.94, 0.96])
+    meshcat.SetProperty("/Background/<object>", "bottom_color", [0.75, 0.76, 0.78])
+    meshcat.SetProperty("/Grid/<object>", "visible", False)
+    meshcat.SetProperty("/Axes/<object>", "visible", False)
+    # Even light over a scene of tens of metres: the viewer's own lamps light one of a few metres.
+    for lamp in ("PointLightNegativeX", "PointLightPositiveX", "SpotLight"):
+        meshcat.SetProperty(f"/Lights/{lamp}/<object>", "intensity", 0.0)
+    meshcat.SetProperty("/Lights/AmbientLight/<object>", "intensity", 1.3)
+    meshcat.SetProperty("/Lights/FillLight/<object>", "intensity", 2.2)
+    meshcat.SetProperty("/Lights/FillLight/<object>", "position", [-6.0, 14.0, 9.0])
 
 
 def _find_view_start(recording: Recording) -> float:
@@ -146,9 +144,9 @@ def _find_view_start(recording: Recording) -> float:
 
 def _set_camera(meshcat: Meshcat, recording: Recording) -> None:
     """Look at the draw point from the side, a little from above, with the digging in the middle."""
-    target = np.array([-3.0, 0.0, 1.2])
-    distance = 13.0
-    meshcat.SetCameraPose(target + np.array([-0.15 * distance, -distance, 0.38 * distance]), target)
+    target = np.array([-3.6, 0.0, 1.4])
+    distance = 10.0
+    meshcat.SetCameraPose(target + np.array([-0.1 * distance, -distance, 0.30 * distance]), target)
 
 
 def _to_transform(pose: Array) -> RigidTransform:

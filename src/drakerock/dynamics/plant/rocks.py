@@ -181,13 +181,17 @@ class PlantRocks(LeafSystem):
                 info = results.point_pair_contact_info(k)
                 pair = info.point_pair()
                 # contact_force() is the force on body B.
-                force = self._find_side(pair.id_B, pair.id_A) * info.contact_force()
-                total += np.concatenate([np.cross(info.contact_point() - p_WB, force), force])
+                side = self._find_side(pair.id_B, pair.id_A)
+                if side:
+                    force = side * info.contact_force()
+                    total += np.concatenate([np.cross(info.contact_point() - p_WB, force), force])
             for k in range(results.num_hydroelastic_contacts()):
                 info = results.hydroelastic_contact_info(k)
                 surface = info.contact_surface()
                 # F_Ac_W() is the force on the body of geometry M, at the surface's centroid.
                 side = self._find_side(surface.id_M(), surface.id_N())
+                if not side:
+                    continue
                 force = side * info.F_Ac_W().translational()
                 arm = surface.centroid() - p_WB
                 total += np.concatenate([side * info.F_Ac_W().rotational() + np.cross(arm, force), force])
