@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import trimesh
-from pydrake.common import MemoryFile
+from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import (
     AddContactMaterial,
+    AddRigidHydroelasticProperties,
     Convex,
     HalfSpace,
-    InMemoryMesh,
     ProximityProperties,
     SceneGraph,
 )
@@ -46,24 +45,33 @@ def add_plant(builder: DiagramBuilder, config: DynamicsConfig) -> tuple[Multibod
     return plant, scene_graph
 
 
-def add_site(plant: MultibodyPlant, site: Site) -> None:
+def add_site(plant: MultibodyPlant, site: Site, config: DynamicsConfig) -> None:
     """Register the site's half-spaces and convex pieces as collision geometry of the world body."""
-    friction = site.config.friction
+    properties = ProximityProperties()
+    # Drake's default dissipation, estimated from a penetration allowance, is so large that rocks sink into
+    # the floor; the site gets the rocks' own, and is stiff beside them.
+    AddContactMaterial(
+        dissipation=config.plant.dissipation,
+        point_stiffness=config.plant.site_stiffness,
+        friction=CoulombFriction(site.config.friction, site.config.friction),
+        properties=properties,
+    )
+    if config.plant.contact_model == "hydroelastic":
+        AddRigidHydroelasticProperties(properties)
+    world = plant.world_body()
     for plane in site.planes:
-        properties = ProximityProperties()
-        AddContactMaterial(friction=CoulombFriction(friction, friction), properties=properties)
         X_WG = HalfSpace.MakePose(plane.normal, plane.normal * plane.offset)
-        plant.RegisterCollisionGeometry(plant.world_body(), X_WG, HalfSpace(), plane.name, properties)
+        plant.RegisterCollisionGeometry(world, X_WG, HalfSpace(), plane.name, properties)
     for piece in site.pieces:
-        properties = ProximityProperties()
-        AddContactMaterial(friction=CoulombFriction(friction, friction), properties=properties)
-        plant.RegisterCollisionGeometry(
-            plant.world_body(), RigidTransform(), make_convex(piece.vertices, piece.name), piece.name, properties
-        )
+        convex = make_convex(piece.vertices, piece.name)
+        plant.RegisterCollisionGeometry(world, RigidTransform(), convex, piece.name, properties)
 
 
 def make_convex(vertices: np.ndarray, name: str, scale: float = 1.0) -> Convex:
     """Return the convex hull of `vertices` (k, 3) [m], scaled, as a Drake shape held in memory."""
-    hull = trimesh.convex.convex_hull(vertices)
-    text = trimesh.exchange.obj.export_obj(hull, include_normals=False, header=None)
-    return Convex(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name)), scale=np.full(3, scale))
+    return Convex(points=np.asfortranarray(vertices.T), label=name, scale=scale)
+
+
+def make_pose(q_WR: np.ndarray, p_WR: np.ndarray) -> RigidTransform:
+    """Return the pose of a quaternion (w, x, y, z), normalised here, and a position [m]."""
+    return RigidTransform(Quaternion(q_WR / np.linalg.norm(q_WR)), p_WR)

@@ -25,7 +25,9 @@ class SensingConfig(Config):
     """The height field and what is read from it."""
 
     cell: Annotated[float, Field(gt=0.02, le=2, description="grid spacing [m]")] = 0.26
-    front_height: Annotated[float, Field(gt=0, le=2, description="the front is where h exceeds this [m]")] = 0.15
+    front_height: Annotated[float, Field(gt=0, le=2, description="the front is where h exceeds this [m]")] = (
+        0.15
+    )
 
 
 class PlanningConfig(Config):
@@ -41,6 +43,9 @@ class PlanningConfig(Config):
     stop_margin: Annotated[
         float, Field(ge=0, le=0.3, description="full tilt is planned this far inside the joint stop [rad]")
     ] = 0.02
+    floor_clearance: Annotated[
+        float, Field(ge=0, le=0.5, description="tip above the floor while it is lowered [m]")
+    ] = 0.03
     run_up: Annotated[float, Field(gt=0, le=30, description="tip to s0 when the loading starts [m]")] = 1.5
     n_segment: Annotated[int, Field(ge=10, le=2000, description="path points a segment")] = 60
 
@@ -59,7 +64,6 @@ class PerformanceConfig(Config):
 
     tau_c: Annotated[float, Field(gt=0, description="critical hinge moment [N m]")] = 145e3
     t_char: Annotated[float, Field(gt=0, description="characteristic time of the damage integral [s]")] = 12.0
-    contact_gap: Annotated[float, Field(ge=0, le=0.1, description="rocks nearer than this touch [m]")] = 0.005
     settle_time: Annotated[
         float, Field(ge=0, le=60, description="at most this long after s4 for the rocks to rest [s]")
     ] = 4.0
@@ -67,7 +71,10 @@ class PerformanceConfig(Config):
     stall_speed: Annotated[
         float, Field(gt=0, description="stall: slower than this while told to drive on [m/s]")
     ] = 0.05
-    slip_ratio: Annotated[float, Field(gt=0, description="slip event: |v_wheel - v| / v_x_max above this")] = 0.5
+    slip_ratio: Annotated[
+        float, Field(gt=0, description="slip event: |v_wheel - v| / v_x_max above this")
+    ] = 0.5
+    event_time: Annotated[float, Field(ge=0, description="shortest stall or slip that counts [s]")] = 0.2
 
 
 class LoadingConfig(Config):

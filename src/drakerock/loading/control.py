@@ -11,7 +11,8 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drakerock.loading.config import ControlConfig
 from drakerock.loading.plan import DigPlan, NoPlan
-from drakerock.machine import MEASUREMENT, Kinematics
+from drakerock.machine.kinematics import Kinematics, calc_joint_rates
+from drakerock.machine.measurement import MEASUREMENT
 
 Array = NDArray[np.float64]
 
@@ -61,22 +62,21 @@ def calc_motor_speeds(
         psi: bucket pitch [rad].
     """
     if mode in (Mode.APPROACH, Mode.S0):
-        speeds = np.array([plan.drive_speed / kinematics.r_w, 0.0, 0.0])
+        speeds = np.array([plan.drive_speed / kinematics.wheel_radius, 0.0, 0.0])
     elif mode == Mode.S1:
         at = project_on_path(plan, 1, x, z)
         v_z = plan.v_z.calc(z) if z < plan.v_z.at[-1] else 0.0
         omega = plan.omega.calc(psi) if psi < plan.omega.at[-1] else 0.0
-        phi_l_rate, phi_b_rate, phi_w_rate = kinematics.calc_joint_rates(
-            float(plan.phi_l[at]), float(plan.phi_b[at]), plan.v_x.calc(x), v_z, omega
+        speeds = calc_joint_rates(
+            kinematics, float(plan.phi_l[at]), float(plan.phi_b[at]), plan.v_x.calc(x), v_z, omega
         )
-        speeds = np.array([phi_w_rate, phi_l_rate, phi_b_rate])
     elif mode == Mode.S2:
         speeds = np.array([0.0, 0.0, -plan.tilt_rate])
     elif mode == Mode.S3:
-        speeds = np.array([-plan.drive_speed / kinematics.r_w, 0.0, 0.0])
+        speeds = np.array([-plan.drive_speed / kinematics.wheel_radius, 0.0, 0.0])
     else:
         speeds = np.zeros(3)
-    limits = np.array([kinematics.max_wheel_rate, kinematics.max_boom_rate, kinematics.max_bucket_rate])
+    limits = np.array([kinematics.wheel_speed, kinematics.boom_speed, kinematics.bucket_speed])
     return np.clip(speeds, -limits, limits)
 
 
@@ -123,6 +123,7 @@ class FeedforwardController(LeafSystem):
         self.set_name("feedforward_controller")
         self._kinematics = kinematics
         self._config = config
+        self._indices = [list(MEASUREMENT).index(name) for name in ("x_T", "z_T", "psi")]
         self._plan = self.DeclareAbstractInputPort("plan", AbstractValue.Make(NoPlan("")))
         self._measurement = self.DeclareVectorInputPort("measurement", len(MEASUREMENT))
         initial = np.zeros(N_STATE)
@@ -135,7 +136,8 @@ class FeedforwardController(LeafSystem):
 
     def _read(self, context: Context) -> tuple[float, float, float]:
         measured = self._measurement.Eval(context)
-        return tuple(float(measured[MEASUREMENT.index(name)]) for name in ("x_T", "z_T", "psi"))
+        x, z, psi = (float(measured[k]) for k in self._indices)
+        return x, z, psi
 
     def _update(self, context: Context, values: DiscreteValues) -> None:
         progress = np.array(context.get_discrete_state_vector().value())

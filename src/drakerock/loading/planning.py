@@ -14,9 +14,37 @@ from scipy.optimize import brentq
 from drakerock.loading.config import PlanningConfig, SensingConfig, StrategyConfig
 from drakerock.loading.field import HeightField, PileProfile, calc_pile_profile
 from drakerock.loading.plan import DigPlan, NoPlan, SpeedTable
-from drakerock.machine import Kinematics
+from drakerock.machine.geometry import BucketGeometry, calc_heaped_capacity
+from drakerock.machine.kinematics import (
+    Kinematics,
+    calc_bucket_range,
+    calc_full_tilt,
+    calc_joint_angles,
+    calc_joint_rates,
+    calc_pitch,
+    calc_tip,
+)
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DiggingMachine:
+    """What a plan needs to know of the machine.
+
+    Attributes:
+        kinematics: lengths, angles, limits.
+        bucket: the bucket's geometry.
+        width: the machine's largest width [m].
+    """
+
+    kinematics: Kinematics
+    bucket: BucketGeometry
+    width: float
+
+    def calc_outline(self) -> Array:
+        """Return the bucket's side profile (k, 2) relative to its tip, at pitch 0 [m]."""
+        return self.bucket.profile - self.bucket.profile[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +59,7 @@ class _Path:
     t: Array
 
 
-def choose_entry_slice(
-    profile: PileProfile, gamma: float, half_room: float
-) -> int | None:
+def choose_entry_slice(profile: PileProfile, gamma: float, half_room: float) -> int | None:
     """Return the index of the slice to enter at, or None if no candidate holds any pile.
 
     The candidates, slices at which the machine fits, are ordered by their centre of mass x_m; gamma = 1 takes
@@ -118,7 +144,7 @@ def sweep_profile(profile: Array, x: Array, z: Array, psi: Array) -> shapely.Geo
 def make_dig_plan(
     field: HeightField,
     strategy: StrategyConfig,
-    kinematics: Kinematics,
+    machine: DiggingMachine,
     config: PlanningConfig,
     sensing: SensingConfig,
     drift_width: float,
@@ -129,51 +155,54 @@ def make_dig_plan(
     Args:
         field: the sensed pile.
         strategy: alpha, beta, gamma, kappa.
-        kinematics: the machine's geometry.
+        machine: the machine's geometry.
         config: speeds and limits.
         sensing: where the front is.
         drift_width: between the walls [m].
         speed_floor: lowest share of a segment's speed, as the controller keeps it.
     """
     profile = calc_pile_profile(field, sensing.front_height)
-    half_room = 0.5 * (drift_width - kinematics.machine_width) - config.wall_clearance
+    kin, width = machine.kinematics, machine.bucket.outer_width
+    half_room = 0.5 * (drift_width - machine.width) - config.wall_clearance
     if half_room < 0:
-        return NoPlan(f"the machine ({kinematics.machine_width:g} m wide) does not fit the drift")
+        return NoPlan(f"the machine ({machine.width:.2f} m wide) does not fit the drift ({drift_width:g} m)")
     entry = choose_entry_slice(profile, strategy.gamma, half_room)
     if entry is None:
         return NoPlan("no candidate slice holds any pile")
     y = float(profile.y[entry])
-    near = np.isfinite(profile.slope) & (np.abs(profile.y - y) <= 0.5 * kinematics.bucket_width)
+    near = np.isfinite(profile.slope) & (np.abs(profile.y - y) <= 0.5 * width)
     slope = float(np.mean(profile.slope[near]))
     x_s0 = float(np.min(profile.x_front[near])) - 0.5 * field.cell
-    h_s2 = strategy.beta * config.r_ft * np.sin(slope)
+    h_s2 = float(strategy.beta * config.r_ft * np.sin(slope))
 
-    dig, psi_m, tables = _plan_dig(strategy.kappa, h_s2, slope, kinematics, config, speed_floor)
-    outline = kinematics.bucket_profile
+    # The tip enters at the clearance above the floor, so that much less is left to lift.
+    lift_height = max(h_s2 - config.floor_clearance, 0.0)
+    dig, psi_m, tables = _plan_dig(strategy.kappa, lift_height, slope, kin, config, speed_floor)
+    outline = machine.calc_outline()
     swept_dig = sweep_profile(outline, dig.x, dig.z, dig.psi)
 
     def calc_swept(depth: float) -> shapely.Geometry:
         push = sweep_profile(outline, np.array([0.0, depth]), np.zeros(2), np.zeros(2))
         moved = shapely.affinity.translate(swept_dig, depth, 0.0)
-        return shapely.affinity.translate(shapely.union(push, moved), x_s0, 0.0)
+        return shapely.affinity.translate(shapely.union(push, moved), x_s0, config.floor_clearance)
 
-    wanted = strategy.alpha * kinematics.bucket_volume
+    wanted = strategy.alpha * calc_heaped_capacity(machine.bucket)
     depth_max = max(0.0, field.x_end - x_s0 - float(np.max(dig.x)))
 
     def calc_excess(depth: float) -> float:
-        return calc_swept_volume(calc_swept(depth), field, y, kinematics.bucket_width) - wanted
+        return calc_swept_volume(calc_swept(depth), field, y, width) - wanted
 
     low, high = calc_excess(0.0), calc_excess(depth_max)
-    reached = low <= 0.0 <= high
+    reached = bool(low <= 0.0 <= high)
     if reached and depth_max > 0:
         depth = float(brentq(calc_excess, 0.0, depth_max, xtol=1e-4))
     else:
         depth = 0.0 if low > 0.0 else depth_max
-        reached = abs(calc_excess(depth)) <= 0.01 * wanted
+        reached = bool(abs(calc_excess(depth)) <= 0.01 * wanted)
     swept = calc_swept(depth)
-    volume = calc_swept_volume(swept, field, y, kinematics.bucket_width)
+    volume = calc_swept_volume(swept, field, y, width)
     return _assemble(
-        x_s0, depth, dig, tables, kinematics, config,
+        x_s0, depth, dig, tables, kin, config,
         y=y, slope=slope, h_s2=h_s2, psi_m=psi_m, volume=volume, volume_wanted=wanted, reached=reached,
         swept=swept,
     )  # fmt: skip
@@ -191,8 +220,8 @@ def _plan_dig(
     kappa: float, h_s2: float, slope: float, kin: Kinematics, config: PlanningConfig, floor: float
 ) -> tuple[_Path, float, _Tables]:
     """Integrate the joints from s1 to s3, the tip starting at x = z = 0; full tilt found by iteration."""
-    phi_l, phi_b = kin.level_phi_l, kin.level_phi_b
-    psi_m = kin.calc_full_tilt(phi_l) - config.stop_margin
+    phi_l, phi_b = (float(angle) for angle in calc_joint_angles(kin, config.floor_clearance, 0.0))
+    psi_m = float(calc_full_tilt(kin, phi_l)) - config.stop_margin
     if h_s2 <= 0.0:
         lift = _Path(*(np.array([value]) for value in (0.0, 0.0, 0.0, phi_l, phi_b, 0.0)))
         tables = _make_tables(0.0, 0.0, 0.0, slope, kin, config, floor, n_lift=1)
@@ -203,7 +232,7 @@ def _plan_dig(
             tables = _make_tables(
                 h_s2, kappa * psi_m, h_s2 / np.tan(slope), slope, kin, config, floor, len(lift.x)
             )
-            updated = kin.calc_full_tilt(float(lift.phi_l[-1])) - config.stop_margin
+            updated = float(calc_full_tilt(kin, float(lift.phi_l[-1]))) - config.stop_margin
             if abs(updated - psi_m) < 1e-6:
                 break
             psi_m = updated
@@ -211,11 +240,11 @@ def _plan_dig(
     turn = np.linspace(0.0, max(psi_m - lift.psi[-1], 0.0), config.n_segment + 1)
     psi = lift.psi[-1] + turn
     phi_l_s2, phi_b_s2 = float(lift.phi_l[-1]), float(lift.phi_b[-1])
-    x_turn, z_turn = kin.calc_tip(np.full_like(turn, phi_l_s2), phi_b_s2 - turn)
-    x0, z0 = kin.calc_tip(phi_l_s2, phi_b_s2)
+    tip = calc_tip(kin, 0.0, phi_l_s2, phi_b_s2 - turn)
+    tip = tip - tip[0]
     path = _Path(
-        np.concatenate([lift.x, lift.x[-1] + (x_turn - x0)[1:]]),
-        np.concatenate([lift.z, lift.z[-1] + (z_turn - z0)[1:]]),
+        np.concatenate([lift.x, lift.x[-1] + tip[1:, 0]]),
+        np.concatenate([lift.z, lift.z[-1] + tip[1:, 1]]),
         np.concatenate([lift.psi, psi[1:]]),
         np.concatenate([lift.phi_l, np.full(config.n_segment, phi_l_s2)]),
         np.concatenate([lift.phi_b, (phi_b_s2 - turn)[1:]]),
@@ -242,7 +271,7 @@ def _make_tables(
     rescale = np.trapezoid(1.0 / turn, u) / np.trapezoid(1.0 / drive, u)
     v_z = rescale * np.tan(slope) * config.v_x_max
     omega = psi_s2 * v_z / h_s2 if h_s2 > 0 else 0.0
-    omega = min(omega, kin.max_bucket_rate)
+    omega = min(omega, kin.bucket_speed)
     return _Tables(
         SpeedTable(u * length, config.v_x_max * drive),
         SpeedTable(u * h_s2, v_z * turn),
@@ -258,7 +287,7 @@ def _integrate_lift(
     length, height = tables.v_x.at[-1], tables.v_z.at[-1]
     psi_end = tables.omega.at[-1]
     dt = length / config.v_x_max / config.n_segment
-    x0, z0 = kin.calc_tip(phi_l, phi_b)
+    z0 = float(calc_tip(kin, 0.0, phi_l, phi_b)[1])
     rows = [(0.0, 0.0, 0.0, phi_l, phi_b, 0.0)]
     x = z = psi = t = 0.0
     while x < length - 1e-9 and z < height - 1e-9:
@@ -267,14 +296,13 @@ def _integrate_lift(
         v_z = tables.v_z.calc(z)
         omega = tables.omega.calc(psi) if psi < psi_end else 0.0
         step_turn = min(omega * step, psi_end - psi) if psi_end > 0 else 0.0
-        d_l, d_b, _ = kin.calc_joint_rates(phi_l, phi_b, v_x * step, v_z * step, step_turn)
-        phi_l_new = max(phi_l + d_l, kin.min_phi_l)
-        phi_b = phi_b + d_b + (phi_l + d_l - phi_l_new)
-        phi_b = max(phi_b, kin.calc_min_phi_b(phi_l_new))
-        phi_l = phi_l_new
+        _, d_l, d_b = calc_joint_rates(kin, phi_l, phi_b, v_x * step, v_z * step, step_turn)
+        phi_l = max(phi_l + d_l, float(kin.phi_l_range[0]))
+        stop, _ = calc_bucket_range(kin, phi_l)
+        phi_b = max(phi_b + d_b, float(stop))
         x, t = x + v_x * step, t + step
-        psi = kin.calc_psi(phi_l, phi_b)
-        z = float(kin.calc_tip(phi_l, phi_b)[1] - z0)
+        psi = float(calc_pitch(kin, phi_l, phi_b))
+        z = float(calc_tip(kin, 0.0, phi_l, phi_b)[1]) - z0
         rows.append((x, z, psi, phi_l, phi_b, t))
     return _Path(*np.array(rows).T)
 
@@ -300,11 +328,11 @@ def _assemble(
     u = np.linspace(0.0, 1.0, n + 1)
     x_s1 = x_s0 + depth
     t_s1 = depth / config.v_x_max
-    x_s3, x_s4 = x_s1 + dig.x[-1], x_s0 - kin.r_bt
+    x_s3, x_s4 = x_s1 + dig.x[-1], x_s0 - kin.bucket_length
     t_s3 = t_s1 + dig.t[-1]
     t_s4 = t_s3 + abs(x_s3 - x_s4) / config.v_x_max
     x = np.concatenate([x_s0 + u * depth, x_s1 + dig.x[1:], (x_s3 + u * (x_s4 - x_s3))[1:]])
-    z = np.concatenate([np.zeros(n + 1), dig.z[1:], np.full(n, dig.z[-1])])
+    z = np.concatenate([np.zeros(n + 1), dig.z[1:], np.full(n, dig.z[-1])]) + config.floor_clearance
     psi = np.concatenate([np.zeros(n + 1), dig.psi[1:], np.full(n, dig.psi[-1])])
     phi_l = np.concatenate([np.full(n + 1, dig.phi_l[0]), dig.phi_l[1:], np.full(n, dig.phi_l[-1])])
     phi_b = np.concatenate([np.full(n + 1, dig.phi_b[0]), dig.phi_b[1:], np.full(n, dig.phi_b[-1])])
@@ -332,7 +360,7 @@ def _assemble(
         t=t,
         segment=segment,
         v_x=SpeedTable(tables.v_x.at + x_s1, tables.v_x.speed),
-        v_z=tables.v_z,
+        v_z=SpeedTable(tables.v_z.at + config.floor_clearance, tables.v_z.speed),
         omega=tables.omega,
         drive_speed=config.v_x_max,
         tilt_rate=config.tilt_rate,
@@ -353,7 +381,7 @@ class DigPlanner(LeafSystem):
     def __init__(
         self,
         strategy: StrategyConfig,
-        kinematics: Kinematics,
+        machine: DiggingMachine,
         config: PlanningConfig,
         sensing: SensingConfig,
         drift_width: float,
@@ -362,7 +390,7 @@ class DigPlanner(LeafSystem):
         """Make the planner of one strategy."""
         super().__init__()
         self.set_name("dig_planner")
-        self._arguments = (strategy, kinematics, config, sensing, drift_width, speed_floor)
+        self._arguments = (strategy, machine, config, sensing, drift_width, speed_floor)
         empty = HeightField(np.zeros(0), np.zeros(0), np.zeros((0, 0)), sensing.cell)
         self._field = self.DeclareAbstractInputPort("height_field", AbstractValue.Make(empty))
         self._plan = self.DeclareAbstractState(AbstractValue.Make(NoPlan("not initialised")))

@@ -22,8 +22,8 @@ def make_grid(site: SiteConfig, cell: float, length: float) -> tuple[Array, Arra
     """Return the cell centres (x, y) that cover the last `length` of the drift before the brow."""
     nx = max(1, int(np.ceil(length / cell)))
     ny = max(1, int(np.floor(site.drift_width / cell)))
-    x = -cell * (np.arange(nx)[::-1] + 0.5)
-    y = cell * (np.arange(ny) - 0.5 * (ny - 1))
+    x = -cell * (np.arange(nx, dtype=np.float64)[::-1] + 0.5)
+    y = cell * (np.arange(ny, dtype=np.float64) - 0.5 * (ny - 1))
     return x, y
 
 
@@ -94,6 +94,4 @@ class PileSensor(LeafSystem):
             size=self._pile.size,
             fixed=self._pile.fixed,
         )
-        output.set_value(
-            calc_height_field(pile, self._shapes, self._site, self._config.cell, self._length)
-        )
+        output.set_value(calc_height_field(pile, self._shapes, self._site, self._config.cell, self._length))

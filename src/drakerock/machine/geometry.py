@@ -81,7 +81,7 @@ def calc_area(polygon: Array) -> float:
 
 
 def calc_heaped_capacity(bucket: BucketGeometry) -> float:
-    """Return the heaped capacity [m^3] after SAE J742: the struck volume and a heap of slope 1:2 on the strike plane."""
+    """Return the heaped capacity [m^3] after SAE J742: the struck volume and a heap of slope 1:2 on it."""
     width, length = bucket.inner_width, float(np.linalg.norm(bucket.profile[-1] - bucket.profile[0]))
     short, long = sorted((width, length))
     heap = short**2 * (3 * long - short) / 24

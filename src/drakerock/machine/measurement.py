@@ -59,7 +59,9 @@ class MachineSensor(LeafSystem):
         self._rates = [n_q + velocity[name] for name in ("boom_joint", "bucket_joint")]
         self._wheels = [n_q + velocity[name] for name in names.WHEEL_JOINTS]
         self._poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
-        self._velocities = self.DeclareAbstractInputPort("body_spatial_velocities", Value([SpatialVelocity()]))
+        self._velocities = self.DeclareAbstractInputPort(
+            "body_spatial_velocities", Value([SpatialVelocity()])
+        )
         self._state = self.DeclareVectorInputPort("machine_state", plant.num_multibody_states(instance))
         self.DeclareVectorOutputPort("measurement", len(MEASUREMENT), self._calc_measurement)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, model_validator
 
@@ -88,14 +88,21 @@ class PileConfig(Config):
     source: Annotated[str | None, Field(description="a stored pile (.npz) to take instead of making one")] = (
         None
     )
-    rocks: Annotated[int, Field(gt=0, le=100_000, description="number of moving rocks to emit")] = 220
-    emission_height: Annotated[float, Field(gt=0, le=60, description="[m]")] = 4.0
-    layer_interval: Annotated[float, Field(gt=0, description="time between emitted layers [s]")] = 0.6
+    rocks: Annotated[int, Field(gt=0, le=100_000, description="number of moving rocks to emit")] = 240
+    emission_height: Annotated[
+        float,
+        Field(gt=0, le=60, description="rocks are emitted between the pile's surface and this height [m]"),
+    ] = 4.4
+    emission_reach: Annotated[
+        float, Field(ge=0, le=50, description="how far before the brow rocks are emitted [m]")
+    ] = 2.4
+    batch_time: Annotated[float, Field(gt=0, le=10, description="time between emitted batches [s]")] = 1.0
     settle_speed: Annotated[
         float, Field(gt=0, description="at rest when 99 % of the rocks are slower than this [m/s]")
     ] = 0.05
     settle_window: Annotated[float, Field(gt=0, description="... by displacement over this time [s]")] = 0.5
-    max_time: Annotated[float, Field(gt=0, description="give up after this simulated time [s]")] = 60.0
-
-
-RockEngine = Literal["plant", "nonsmooth"]
+    max_time: Annotated[float, Field(gt=0, description="give up settling after this time [s]")] = 15.0
+    contact_gap: Annotated[
+        float,
+        Field(ge=0, le=0.1, description="rocks nearer than this touch: debris is what touches no pile [m]"),
+    ] = 0.005

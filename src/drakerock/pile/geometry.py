@@ -16,7 +16,9 @@ Array = NDArray[np.float64]
 def make_pile_mesh(pile: PileState, shapes: tuple[RockShape, ...]) -> trimesh.Trimesh:
     """Return all rocks' surfaces in W as one mesh, in the order of the rocks."""
     vertices, triangles, offset = [], [], 0
-    R_WRs = Rotation.from_quat(pile.q_WRs, scalar_first=True).as_matrix() if len(pile) else np.zeros((0, 3, 3))
+    R_WRs = (
+        Rotation.from_quat(pile.q_WRs, scalar_first=True).as_matrix() if len(pile) else np.zeros((0, 3, 3))
+    )
     for rock in range(len(pile)):
         shape = shapes[pile.shape[rock]]
         vertices.append(pile.size[rock] * shape.vertices @ R_WRs[rock].T + pile.p_WRs[rock])

@@ -127,7 +127,9 @@ class PileState:
 
     def join(self, other: PileState) -> PileState:
         """Return the pile of the rocks of both, this one's first; the provenance is this one's."""
-        arrays: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _ARRAYS}
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _ARRAYS
+        }
         return replace(self, **arrays)
 
     def calc_masses(self, shape_volumes: Array, density: float) -> Array:

@@ -12,12 +12,11 @@ from pydrake.geometry import (
     ProximityProperties,
 )
 from pydrake.math import RigidTransform
-from pydrake.common.eigen_geometry import Quaternion
 from pydrake.multibody.plant import ContactResults, CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import RotationalInertia, SpatialInertia
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 
-from drakerock.dynamics.assembly import make_convex
+from drakerock.dynamics.assembly import make_convex, make_pose
 from drakerock.dynamics.config import DynamicsConfig
 from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.materials import calc_contact_stiffness
@@ -50,7 +49,7 @@ def add_rock_bodies(
         inertia, convex, properties = kinds[int(pile.shape[rock]), float(pile.size[rock])]
         name = _name(rock)
         if pile.fixed[rock]:
-            X_WR = _make_pose(pile.q_WRs[rock], pile.p_WRs[rock])
+            X_WR = make_pose(pile.q_WRs[rock], pile.p_WRs[rock])
             body = plant.world_body()
         else:
             X_WR = RigidTransform()
@@ -108,9 +107,11 @@ class PlantRocks(LeafSystem):
         self._plant = plant
         self._pile = pile
         self._free = np.flatnonzero(~pile.fixed)
-        bodies = [plant.GetBodyByName(_name(rock)) for rock in self._free]
+        bodies = [plant.GetBodyByName(_name(int(rock))) for rock in self._free]
         self._q = np.array([body.floating_positions_start() for body in bodies], int)
-        self._v = np.array([body.floating_velocities_start_in_v() for body in bodies], int) + plant.num_positions()
+        self._v = (
+            np.array([body.floating_velocities_start_in_v() for body in bodies], int) + plant.num_positions()
+        )
         self._rock_geometries = frozenset(geometries)
         self._bucket = plant.GetBodyByName("bucket") if plant.HasBodyNamed("bucket") else None
         self._bucket_geometries = frozenset(
@@ -180,13 +181,17 @@ class PlantRocks(LeafSystem):
                 info = results.point_pair_contact_info(k)
                 pair = info.point_pair()
                 # contact_force() is the force on body B.
-                force = self._find_side(pair.id_B, pair.id_A) * info.contact_force()
-                total += np.concatenate([np.cross(info.contact_point() - p_WB, force), force])
+                side = self._find_side(pair.id_B, pair.id_A)
+                if side:
+                    force = side * info.contact_force()
+                    total += np.concatenate([np.cross(info.contact_point() - p_WB, force), force])
             for k in range(results.num_hydroelastic_contacts()):
                 info = results.hydroelastic_contact_info(k)
                 surface = info.contact_surface()
                 # F_Ac_W() is the force on the body of geometry M, at the surface's centroid.
                 side = self._find_side(surface.id_M(), surface.id_N())
+                if not side:
+                    continue
                 force = side * info.F_Ac_W().translational()
                 arm = surface.centroid() - p_WB
                 total += np.concatenate([side * info.F_Ac_W().rotational() + np.cross(arm, force), force])
@@ -214,7 +219,3 @@ def add_plant_rocks(
 
 def _name(rock: int) -> str:
     return f"rock_{rock}"
-
-
-def _make_pose(q_WR: Array, p_WR: Array) -> RigidTransform:
-    return RigidTransform(Quaternion(q_WR / np.linalg.norm(q_WR)), p_WR)
