@@ -73,6 +73,7 @@ def make_engine(
     site: Site | None = None,
     rocks: RocksConfig | None = None,
     config: NonsmoothConfig | None = None,
+    time_step: float = 0.01,
     **options,
 ) -> NonsmoothEngine:
     return NonsmoothEngine(
@@ -80,6 +81,7 @@ def make_engine(
         shapes,
         site or make_plane_site(),
         config or NonsmoothConfig(reduction="none"),
+        time_step,
         pile.shape,
         pile.size,
         pile.fixed,

@@ -39,7 +39,6 @@ class RestConfig(Config):
 class NonsmoothConfig(Config):
     """The nonsmooth engine: stepper, contact solve, collision margins, reduction."""
 
-    time_step: Annotated[float, Field(gt=0, le=0.05, description="[s]")] = 0.01
     iterations: Annotated[int, Field(ge=1, le=2000, description="sweeps of the resting stage")] = 50
     impact_iterations: Annotated[int, Field(ge=1, le=500, description="sweeps of the impact stage")] = 10
     impact_threshold: Annotated[

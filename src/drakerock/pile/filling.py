@@ -14,8 +14,10 @@ from drakerock.pile.state import PileState
 Array = NDArray[np.float64]
 ArraysT = TypeVar("ArraysT")
 
-# The void is full when this many layers in a row found no room under the emitter.
-FULL_AFTER = 12
+# The void is full when this many layers in a row found no room.
+FULL_AFTER = 8
+# A layer that takes a smaller share of the rocks on offer (at most 50) found no room.
+FEW = 0.1
 # How much faster than free fall from rest rocks start, so that layers clear the emitter in time [m/s].
 START_SPEED = 3.0
 PLACING_TRIES = 12
@@ -87,7 +89,7 @@ def fill(
             chosen, places = _find_places(
                 queue, engine.radius, occupied, config.emission_height, layer, site.void_depth, half, rng
             )
-            missed = 0 if len(chosen) else missed + 1
+            missed = 0 if len(chosen) > FEW * len(queue[:50]) else missed + 1
             velocities = np.zeros((len(chosen), 6))
             velocities[:, 5] = -START_SPEED
             arrays = engine.place(arrays, chosen, places, velocities)

@@ -123,14 +123,21 @@ class PileState:
     def select(self, rocks: NDArray[Any]) -> PileState:
         """Return the pile of the rocks chosen by an index or mask array (n,)."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rocks] for name in _ARRAYS}
-        return replace(self, **arrays)
+        contacts = None
+        if self.contacts is not None:
+            contacts = self.contacts.select(np.arange(len(self))[rocks], len(self))
+        return replace(self, **arrays, contacts=contacts)
 
     def join(self, other: PileState) -> PileState:
         """Return the pile of the rocks of both, this one's first; the provenance is this one's."""
         arrays: dict[str, Any] = {
             name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _ARRAYS
         }
-        return replace(self, **arrays)
+        contacts = None
+        if self.contacts is not None or other.contacts is not None:
+            first = self.contacts or make_empty_contacts(len(self))
+            contacts = first.join(other.contacts or make_empty_contacts(len(other)))
+        return replace(self, **arrays, contacts=contacts)
 
     def calc_masses(self, shape_volumes: Array, density: float) -> Array:
         """Return the masses (n,) [kg], given the shapes' volumes at sieve width 1 (k,) [m^3]."""

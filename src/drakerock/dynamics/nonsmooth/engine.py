@@ -149,6 +149,7 @@ class NonsmoothEngine:
         shapes: the scenario's rock shapes.
         site: planes and convex pieces.
         config: settings.
+        time_step: [s].
         shape, size, fixed: (n,) of the rocks, as in a `PileState`.
         pieces: the machine's.
         n_machine_bodies: number of machine bodies.
@@ -161,6 +162,7 @@ class NonsmoothEngine:
         shapes: Sequence[RockShape],
         site: Site,
         config: NonsmoothConfig,
+        time_step: float,
         shape: IntArray,
         size: Array,
         fixed: NDArray[np.bool_],
@@ -170,6 +172,7 @@ class NonsmoothEngine:
     ) -> None:
         announce_compilation()
         self.config = config
+        self.time_step = time_step
         self.n_rocks = n = len(size)
         self.shape_index = np.asarray(shape, np.int64)
         self.size = np.asarray(size, float)
@@ -367,11 +370,6 @@ class NonsmoothEngine:
 
     # ---- the step
 
-    @property
-    def time_step(self) -> float:
-        """Time step [s]."""
-        return self.config.time_step
-
     def advance(self, arrays: RockArrays) -> tuple[RockArrays, StepReport]:
         """Step without a machine; see `step`."""
         return self.step(arrays, make_machineless_step())
@@ -401,7 +399,7 @@ class NonsmoothEngine:
     def _try_step(
         self, arrays: RockArrays, machine: MachineStep, iterations: int, warm: bool
     ) -> tuple[RockArrays, StepReport] | tuple[None, None]:
-        config, n, dt = self.config, self.n_rocks, self.config.time_step
+        config, n, dt = self.config, self.n_rocks, self.time_step
         book = arrays.book.copy()
         memory = arrays.memory[: arrays.n_memory]
         n_woken = 0
@@ -497,7 +495,7 @@ class NonsmoothEngine:
 
     def _pose(self, arrays: RockArrays, machine: MachineStep, awake: IntArray) -> None:
         """Set positions, rotations and boxes: of awake rocks, of others that were moved, of the machine."""
-        n, dt, margin = self.n_rocks, self.config.time_step, self.config.contact_margin
+        n, dt, margin = self.n_rocks, self.time_step, self.config.contact_margin
         self._positions[:n] = arrays.positions
         poses = np.hstack([arrays.quaternions, arrays.positions])
         stale = (poses != self._posed).any(axis=1)
@@ -578,7 +576,7 @@ class NonsmoothEngine:
             n_rows = narrow_phase.find_contacts(
                 self._pair_a, self._pair_b, n_pairs, self.n_rocks, self.first_plane, self.first_piece,
                 self.planes, self.convex, self.shape, self.scale, self._positions, self._rotations,
-                self._velocities, self.solver_body, self.friction, self.restitution, config.time_step,
+                self._velocities, self.solver_body, self.friction, self.restitution, self.time_step,
                 config.contact_margin, config.manifold_gap, config.face_cosine, memory, self._table,
                 self._axis_keys, self._axes, self._rows, self._body_a, self._body_b, self._row_key,
                 self._row_rock, self._statistics,
@@ -603,7 +601,7 @@ class NonsmoothEngine:
             impulses = impulses + self._impacts[chosen]
         torques = np.cross(rows[:, contacts.ARM_B : contacts.ARM_B + 3], impulses)
         body = self._body_b[chosen] - self.n_rocks - 1
-        np.add.at(forces, body, np.hstack([torques, impulses]) / self.config.time_step)
+        np.add.at(forces, body, np.hstack([torques, impulses]) / self.time_step)
         return forces
 
 
