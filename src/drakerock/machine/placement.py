@@ -10,6 +10,7 @@ from pydrake.systems.framework import Context
 from drakerock.errors import InputError
 from drakerock.machine import names
 from drakerock.machine.kinematics import calc_bucket_range, calc_joint_angles, make_kinematics
+from drakerock.machine.linkage import Linkage
 from drakerock.machine.model import Machine
 
 
@@ -43,8 +44,8 @@ def set_machine_pose(
     plant.SetVelocities(context, instance, np.zeros(plant.num_velocities(instance)))
     front = plant.GetBodyByName("front_unit", instance)
     tip = plant.GetFrameByName("tip", instance)
-    boom = plant.GetJointByName("boom_joint", instance)
-    bucket = plant.GetJointByName("bucket_joint", instance)
+    linkage = Linkage(plant, context, instance, machine.loops)
+    linkage.reset(*(float(angle) for angle in calc_joint_angles(kin, 0.0, 0.0)))
 
     sink, pitch, z_level, psi_level = 0.0, 0.0, z_tip, psi
     for _ in range(4):
@@ -53,13 +54,14 @@ def set_machine_pose(
         low, high = calc_bucket_range(kin, phi_l)
         if not (kin.phi_l_range[0] <= phi_l <= kin.phi_l_range[1] and low <= phi_b <= high):
             raise InputError(f"the machine can't reach z_tip = {z_tip:.3f} m with psi = {psi:.3f} rad")
-        boom.set_angle(context, phi_l)
-        bucket.set_angle(context, phi_b)
-        X_WF = RigidTransform(RollPitchYaw(0, pitch, 0), [0, y, kin.wheel_radius - sink])
+        linkage.move(machine.steering_angle, phi_l, phi_b)
+        X_WF = RigidTransform(RollPitchYaw(0, pitch, 0), np.array([0, y, kin.wheel_radius - sink]))
         plant.SetFreeBodyPose(context, front, X_WF)
         p_WT = tip.CalcPoseInWorld(context).translation()
         plant.SetFreeBodyPose(
-            context, front, RigidTransform(X_WF.rotation(), X_WF.translation() + [x_tip - p_WT[0], 0, 0])
+            context,
+            front,
+            RigidTransform(X_WF.rotation(), X_WF.translation() + np.array([x_tip - p_WT[0], 0, 0])),
         )
         z_level += z_tip - p_WT[2]
         psi_level = psi + pitch
