@@ -1,7 +1,8 @@
-"""Writes a machine's SDFormat file and meshes from its design: python sdf/make_machine.py sdf/lhd/design.yaml.
+"""Writes a machine's SDFormat file and meshes: python sdf/make_machine.py sdf/lhd/design.yaml.
 
-The design states shapes, pins and masses; this works out what SDFormat wants on top: link poses, inertias from the
-shapes, the cylinders' joint limits, the points of the loop constraints. The package itself reads the SDFormat only.
+The design states shapes, pins and masses; this works out what SDFormat wants on top: link poses, inertias
+from the shapes, the cylinders' joint limits, the points of the loop constraints. The package itself reads the
+SDFormat only.
 """
 
 from __future__ import annotations
@@ -69,8 +70,8 @@ class Writer:
 
         members = "".join(f"<drake:member>{link}</drake:member>" for link in self.links)
         self.lines.append(
-            f'<drake:collision_filter_group name="machine">{members}<drake:ignored_collision_filter_group>machine'
-            "</drake:ignored_collision_filter_group></drake:collision_filter_group>"
+            f'<drake:collision_filter_group name="machine">{members}'
+            "<drake:ignored_collision_filter_group>machine</drake:ignored_collision_filter_group></drake:collision_filter_group>"
         )
         text = "\n".join(
             [
@@ -87,7 +88,7 @@ class Writer:
         )
         (self.folder / f"{self.name}.sdf").write_text(text)
 
-    # -- parts ------------------------------------------------------------------------------------------------------
+    # -- parts
 
     def add_wheels(self) -> None:
         """Add the four wheels: an ellipsoid touches the floor in one smoothly moving point."""
@@ -121,13 +122,13 @@ class Writer:
         r = pads["radius"]
         proximity = make_proximity(self.design["steel"] | {"friction": pads["friction"]})
         return "".join(
-            f'<collision name="pad_{i}">{pose_tag([x, y, z + r])}<geometry><sphere><radius>{r}</radius></sphere>'
-            f"</geometry>{proximity}</collision>"
+            f'<collision name="pad_{i}">{pose_tag([x, y, z + r])}<geometry>'
+            f"<sphere><radius>{r}</radius></sphere></geometry>{proximity}</collision>"
             for i, (x, y) in enumerate((x, sign * pads["y"]) for x in pads["x"] for sign in (1, -1))
         )
 
     def add_linkage(self) -> None:
-        """Add the links and cylinders behind boom and bucket, closed by ball constraints in the reference pose."""
+        """Add the links and cylinders behind boom and bucket, closed by ball constraints."""
         reference = self.calc_reference()
         for name, spec in self.design["links"].items():
             parent, *base = spec["base"]
@@ -179,7 +180,7 @@ class Writer:
             "",
         )
         self.add_joint(f"{name}_rod_joint", "prismatic", f"{name}_barrel", f"{name}_rod", "0 0 1",
-                       (shortest - length, longest - length))  # fmt: skip
+                       (shortest - length, longest - length), damping=spec["damping"])  # fmt: skip
         self.add_loop(f"{name}_rod", np.zeros(3), end_body, end)
 
     def calc_reference(self) -> dict[str, np.ndarray]:
@@ -192,7 +193,7 @@ class Writer:
         rear = make_transform([self.design["articulation"]["x"], 0, 0])
         return {"front_unit": np.eye(4), "rear_unit": rear, "boom": boom, "bucket": bucket}
 
-    # -- SDFormat elements ------------------------------------------------------------------------------------------
+    # -- SDFormat elements
 
     def add_body(
         self, name: str, link_pose: str, body: dict[str, Any], proximity: str, extra: str = ""
@@ -237,6 +238,7 @@ class Writer:
         limits: tuple[float, float] | None = None,
         motor: dict[str, float] | None = None,
         gains: tuple[float, float] | None = None,
+        damping: float = 0.0,
     ) -> None:
         """Add a joint; without gains it has no actuator."""
         text = f"<lower>{limits[0]:.9f}</lower><upper>{limits[1]:.9f}</upper>" if limits else ""
@@ -244,10 +246,11 @@ class Writer:
             text += f"<effort>{motor['effort']:g}</effort><velocity>{motor['velocity']:g}</velocity>"
         elif gains is None:
             text += "<effort>0</effort>"
+        drag = f"<dynamics><damping>{damping:g}</damping></dynamics>" if damping else ""
         gain = f'<drake:controller_gains p="{gains[0]:g}" d="{gains[1]:g}"/>' if gains else ""
         self.lines.append(
             f'<joint name="{name}" type="{kind}"><parent>{parent}</parent><child>{child}</child>'
-            f"<axis><xyz>{axis}</xyz><limit>{text}</limit></axis>{gain}</joint>"
+            f"<axis><xyz>{axis}</xyz><limit>{text}</limit>{drag}</axis>{gain}</joint>"
         )
 
     def add_loop(self, body_a: str, p_a: Any, body_b: str, p_b: Any) -> None:
@@ -287,7 +290,7 @@ class Writer:
         return f"package://drakerock/{self.name}/{file}"
 
 
-# -- shapes -----------------------------------------------------------------------------------------------------------
+# -- shapes
 
 
 def make_prism(polygon: list[list[float]], y: tuple[float, float]) -> Mesh:
@@ -349,7 +352,7 @@ def make_rod_prisms(p_end: np.ndarray) -> list[dict[str, Any]]:
 
 
 def make_inertial(meshes: list[Mesh], mass: float, com: list[float] | None = None) -> str:
-    """Return <inertial> of the meshes at one density that gives `mass`; `com` [x, z] moves the centre of mass."""
+    """Return <inertial> of the meshes at one density that gives `mass`; `com` [x, z] moves the centre."""
     volume = sum(mesh.volume for mesh in meshes)
     center = sum(mesh.volume * mesh.center_mass for mesh in meshes) / volume
     inertia = np.zeros((3, 3))
@@ -366,7 +369,7 @@ def make_inertial(meshes: list[Mesh], mass: float, com: list[float] | None = Non
     return f"<inertial>{pose_tag(center)}<mass>{mass:g}</mass><inertia>{entries}</inertia></inertial>"
 
 
-# -- poses and text ---------------------------------------------------------------------------------------------------
+# -- poses and text
 
 
 def make_transform(p: Any, pitch: float = 0.0) -> np.ndarray:

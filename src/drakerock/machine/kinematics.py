@@ -233,3 +233,19 @@ def calc_joint_angles(kin: Kinematics, z_tip: ArrayLike, psi: ArrayLike) -> tupl
     ) / kin.boom_length
     phi_l = np.arccos(np.where(np.abs(cosine) <= 1, cosine, np.nan))
     return phi_l, phi - phi_l
+
+
+def calc_reach(kin: Kinematics, slope: float) -> float:
+    """Return r_ft [m]: how far up a plane slope [rad] the tip of the level bucket gets.
+
+    The front wheels touch the slope's front; measured along the slope from its toe (section 5).
+    """
+    # Wheel on the floor and against the slope: the toe lies this far ahead of the axle.
+    x_toe = kin.wheel_radius * np.tan(slope / 2)
+
+    def calc_height_above_slope(phi_l: float) -> float:
+        x, z = calc_tip(kin, 0.0, phi_l, kin.phi_level - phi_l)
+        return float(z - (x - x_toe) * np.tan(slope))
+
+    phi_l = brentq(calc_height_above_slope, *kin.phi_l_range)
+    return float((calc_tip(kin, 0.0, phi_l, kin.phi_level - phi_l)[0] - x_toe) / np.cos(slope))
