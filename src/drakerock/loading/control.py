@@ -11,7 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drakerock.loading.config import ControlConfig
 from drakerock.loading.plan import DigPlan, NoPlan
-from drakerock.machine.kinematics import Kinematics, calc_joint_rates
+from drakerock.machine.kinematics import Kinematics, calc_bucket_range, calc_joint_rates
 from drakerock.machine.measurement import MEASUREMENT
 
 Array = NDArray[np.float64]
@@ -34,6 +34,8 @@ MODE, ENTERED = 0, 1
 WAYPOINT_TIMES = slice(2, 7)  # t0 to t4, nan until passed
 TIMEOUTS = slice(7, 12)  # 1 where a mode (APPROACH to S3) ended by its time-out
 N_STATE = 12
+
+FULL_TILT_TOLERANCE = 0.005  # the joint limit gives this much under load [rad]
 
 
 def project_on_path(plan: DigPlan, segment: int, x: float, z: float) -> int:
@@ -80,8 +82,29 @@ def calc_motor_speeds(
     return np.clip(speeds, -limits, limits)
 
 
-def calc_passed(plan: DigPlan, mode: Mode, x: float, z: float, psi: float) -> bool:
-    """Return whether the waypoint that ends `mode` is passed: s0, s1, s4 by x, s2 by x or z, s3 by psi."""
+def calc_passed(
+    plan: DigPlan,
+    mode: Mode,
+    kinematics: Kinematics,
+    x: float,
+    z: float,
+    psi: float,
+    phi_l: float,
+    phi_b: float,
+) -> bool:
+    """Return whether the waypoint that ends `mode` is passed: s0, s1, s4 by x, s2 by x or z, s3 by psi.
+
+    s3 is also passed at the full-tilt stop: a boom that sags under its load, or a chassis that pitches, can
+    leave the bucket at its stop with psi short of the plan, and nothing is left to turn then.
+
+    Args:
+        plan: the plan.
+        mode: the segment driven.
+        kinematics: the machine's geometry.
+        x, z: tip position in W [m].
+        psi: bucket pitch [rad].
+        phi_l, phi_b: joint angles [rad].
+    """
     if mode == Mode.APPROACH:
         return x >= plan.waypoint_x[0]
     if mode == Mode.S0:
@@ -89,7 +112,8 @@ def calc_passed(plan: DigPlan, mode: Mode, x: float, z: float, psi: float) -> bo
     if mode == Mode.S1:
         return x >= plan.waypoint_x[2] or z >= plan.waypoint_z[2]
     if mode == Mode.S2:
-        return psi >= plan.waypoint_psi[3]
+        at_stop = phi_b <= calc_bucket_range(kinematics, phi_l)[0] + FULL_TILT_TOLERANCE
+        return bool(psi >= plan.waypoint_psi[3] or at_stop)
     if mode == Mode.S3:
         return x <= plan.waypoint_x[4]
     return False
@@ -123,7 +147,7 @@ class FeedforwardController(LeafSystem):
         self.set_name("feedforward_controller")
         self._kinematics = kinematics
         self._config = config
-        self._indices = [list(MEASUREMENT).index(name) for name in ("x_T", "z_T", "psi")]
+        self._indices = [list(MEASUREMENT).index(name) for name in ("x_T", "z_T", "psi", "phi_l", "phi_b")]
         self._plan = self.DeclareAbstractInputPort("plan", AbstractValue.Make(NoPlan("")))
         self._measurement = self.DeclareVectorInputPort("measurement", len(MEASUREMENT))
         initial = np.zeros(N_STATE)
@@ -134,10 +158,10 @@ class FeedforwardController(LeafSystem):
         self.DeclareVectorOutputPort("mode", 1, self._calc_mode, {self.discrete_state_ticket(state)})
         self.DeclareStateOutputPort("progress", state)
 
-    def _read(self, context: Context) -> tuple[float, float, float]:
+    def _read(self, context: Context) -> list[float]:
+        """Return x_T, z_T, psi, phi_l, phi_b."""
         measured = self._measurement.Eval(context)
-        x, z, psi = (float(measured[k]) for k in self._indices)
-        return x, z, psi
+        return [float(measured[k]) for k in self._indices]
 
     def _update(self, context: Context, values: DiscreteValues) -> None:
         progress = np.array(context.get_discrete_state_vector().value())
@@ -148,7 +172,7 @@ class FeedforwardController(LeafSystem):
                 progress[MODE], progress[ENTERED] = Mode.ABORTED, time
         elif mode < Mode.DONE:
             late = time - progress[ENTERED] > calc_allowed_time(plan, mode, self._config.timeout)
-            passed = calc_passed(plan, mode, *self._read(context))
+            passed = calc_passed(plan, mode, self._kinematics, *self._read(context))
             if passed or late:
                 progress[TIMEOUTS][mode] = float(not passed)
                 progress[WAYPOINT_TIMES][mode] = time
@@ -161,7 +185,7 @@ class FeedforwardController(LeafSystem):
             output.SetFromVector(np.zeros(3))
             return
         mode = Mode(int(context.get_discrete_state_vector()[MODE]))
-        output.SetFromVector(calc_motor_speeds(plan, mode, self._kinematics, *self._read(context)))
+        output.SetFromVector(calc_motor_speeds(plan, mode, self._kinematics, *self._read(context)[:3]))
 
     def _calc_mode(self, context: Context, output: BasicVector) -> None:
         output[0] = context.get_discrete_state_vector()[MODE]

@@ -177,7 +177,18 @@ def make_dig_plan(
 
     # The tip enters at the clearance above the floor, so that much less is left to lift.
     lift_height = max(h_s2 - config.floor_clearance, 0.0)
-    dig, psi_m, tables = _plan_dig(strategy.kappa, lift_height, slope, kin, config, speed_floor)
+
+    def plan_dig(height: float) -> tuple[_Path, float, _Tables]:
+        return _plan_dig(strategy.kappa, height, slope, kin, config, speed_floor)
+
+    def calc_overshoot(height: float) -> float:
+        return x_s0 + float(np.max(plan_dig(height)[0].x)) - field.x_end
+
+    if lift_height > 0.0 and calc_overshoot(lift_height) > 0.0:
+        # Too little room before the drift's rear end for the whole lift: it ends lower.
+        lift_height = float(brentq(calc_overshoot, 0.0, lift_height)) if calc_overshoot(0.0) < 0.0 else 0.0
+        h_s2 = lift_height + config.floor_clearance
+    dig, psi_m, tables = plan_dig(lift_height)
     outline = machine.calc_outline()
     swept_dig = sweep_profile(outline, dig.x, dig.z, dig.psi)
 
@@ -267,14 +278,14 @@ def _make_tables(
     u = np.linspace(0.0, 1.0, 201)
     drive = calc_ramp(u, config.ramp, floor, up=False, down=True)
     turn = calc_ramp(u, config.ramp, floor, up=True, down=True)
-    # A slower start is made up for on the plateau, so that the integral over the segment stays.
+    v_z = np.tan(slope) * config.v_x_max
+    # The curl starts slowly too; its plateau makes up for that, so that the integral over the segment stays.
     rescale = np.trapezoid(1.0 / turn, u) / np.trapezoid(1.0 / drive, u)
-    v_z = rescale * np.tan(slope) * config.v_x_max
-    omega = psi_s2 * v_z / h_s2 if h_s2 > 0 else 0.0
+    omega = rescale * psi_s2 * v_z / h_s2 if h_s2 > 0 else 0.0
     omega = min(omega, kin.bucket_speed)
     return _Tables(
         SpeedTable(u * length, config.v_x_max * drive),
-        SpeedTable(u * h_s2, v_z * turn),
+        SpeedTable(u * h_s2, v_z * drive),
         SpeedTable(u * psi_s2, omega * turn),
         n_lift,
     )

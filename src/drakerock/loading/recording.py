@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import trimesh
@@ -29,12 +27,14 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drakerock.errors import InputError
 from drakerock.machine.model import Machine
+from drakerock.npz import load_arrays, save_arrays
 from drakerock.pile.config import SiteConfig
 from drakerock.pile.shapes import RockShape
 from drakerock.pile.state import PileState
 
 Array = NDArray[np.float64]
 FORMAT = "drakerock-recording"
+VERSION = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,13 +163,8 @@ class Recorder:
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:
-    """Write a recording as compressed npz.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a recording as npz; InputError if the file cannot be written."""
     header = {
-        "format": FORMAT,
         "bodies": recording.bodies,
         "visual_bodies": [visual.body for visual in recording.visuals],
         "n_shapes": len(recording.rock_shapes),
@@ -181,43 +176,27 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         arrays |= {f"visual_{k}_{name}": getattr(visual, name) for name in ("vertices", "triangles", "rgba")}
     for k, (vertices, triangles) in enumerate(recording.rock_shapes):
         arrays |= {f"shape_{k}_vertices": vertices, f"shape_{k}_triangles": triangles}
-    try:
-        with open(path, "wb") as file:
-            np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    save_arrays(path, FORMAT, VERSION, header, arrays)
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Read a recording.
-
-    Raises:
-        InputError: missing, foreign or damaged.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            header = json.loads(str(data["header"]))
-            if header["format"] != FORMAT:
-                raise KeyError(FORMAT)
-            visuals = tuple(
-                Visual(body, *(data[f"visual_{k}_{name}"] for name in ("vertices", "triangles", "rgba")))
-                for k, body in enumerate(header["visual_bodies"])
-            )
-            shapes = tuple(
-                (data[f"shape_{k}_vertices"], data[f"shape_{k}_triangles"]) for k in range(header["n_shapes"])
-            )
-            return Recording(
-                bodies=tuple(header["bodies"]),
-                visuals=visuals,
-                rock_shapes=shapes,
-                site=SiteConfig(**header["site"]),
-                notes=header["notes"],
-                **{name: data[name] for name in _ARRAYS},
-            )
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such recording") from None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile):
-        raise InputError(f"{path}: not a readable drakerock recording") from None
+    """Read a recording; InputError if it is missing, foreign, damaged or newer."""
+    header, data = load_arrays(path, FORMAT, VERSION)
+    visuals = tuple(
+        Visual(body, *(data[f"visual_{k}_{name}"] for name in ("vertices", "triangles", "rgba")))
+        for k, body in enumerate(header["visual_bodies"])
+    )
+    shapes = tuple(
+        (data[f"shape_{k}_vertices"], data[f"shape_{k}_triangles"]) for k in range(header["n_shapes"])
+    )
+    return Recording(
+        bodies=tuple(header["bodies"]),
+        visuals=visuals,
+        rock_shapes=shapes,
+        site=SiteConfig(**header["site"]),
+        notes=header["notes"],
+        **{name: data[name] for name in _ARRAYS},
+    )
 
 
 _ARRAYS = (

@@ -32,3 +32,31 @@ class MachineConfig(Config):
     steering_angle_deg: float = Field(
         default=0.0, ge=-45, le=45, description="angle held at the articulation, positive turns left [deg]"
     )
+
+
+class MachineData(Config):
+    """What `run_machine_checks` expects of the machine; none: the value is reported without judgement."""
+
+    total_mass: float | None = Field(default=60580.0, gt=0, description="[kg]")
+    payload: float = Field(default=21000.0, gt=0, description="mass the boom has to lift at the bucket [kg]")
+    heaped_capacity: float | None = Field(default=8.0, gt=0, description="heaped bucket volume [m^3]")
+    breakout_force: float | None = Field(
+        default=378e3, gt=0, description="vertical tip force, chassis held [N]"
+    )
+    reach: float | None = Field(default=4.24, gt=0, description="r_ft at the slope below [m]")
+    reach_slope_deg: float = Field(
+        default=40.0, gt=0, lt=80, description="slope at which r_ft is taken [deg]"
+    )
+    critical_moment: float | None = Field(
+        default=145e3, gt=0, description="tau_c of the damage measure, for comparison only [N m]"
+    )
+
+
+class CheckConfig(Config):
+    """The bench on which the machine is checked."""
+
+    time_step: float = Field(default=0.01, gt=0, description="of the plant [s]")
+    contact_approximation: str = Field(default="lagged", pattern="^(lagged|similar|sap)$")
+    floor_friction: float = Field(default=1.125, gt=0, description="of the floor; tyres bring their own")
+    floor_stiffness: float = Field(default=1e10, gt=0, description="of floor and obstacles [N/m]")
+    floor_dissipation: float = Field(default=1.0, ge=0, description="of floor and obstacles [s/m]")

@@ -10,13 +10,14 @@ from pydrake.geometry import (
     Convex,
     Cylinder,
     Ellipsoid,
+    GeometryId,
     Mesh,
     SceneGraph,
     SceneGraphInspector,
     Shape,
     Sphere,
 )
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 
 from drakerock.errors import InputError
 from drakerock.machine import names
@@ -30,10 +31,10 @@ class BucketGeometry:
     """The inside of the bucket, in its frame B.
 
     Attributes:
-        profile: (k, 2) x, z of the inside in side view [m], from the lip's edge over floor and back to the top edge;
+        profile: (k, 2) x, z of the inside in side view [m], from the lip's edge to the top edge of the back;
             the line from last to first point is the strike line.
-        load_region: (k + 2, 2) profile with the largest heap above the strike line [m]: what lies in it and within
-            the inner width counts as load.
+        load_region: (k + 2, 2) profile with the largest heap above the strike line [m]: what lies in it and
+            within the inner width counts as load.
         inner_width: between the side plates [m].
         outer_width: over the side plates [m].
     """
@@ -56,13 +57,13 @@ def make_bucket_geometry(plant: MultibodyPlant, scene_graph: SceneGraph, machine
     """Read the bucket's geometry off the finalized plant."""
     context = plant.CreateDefaultContext()
     bucket = plant.GetFrameByName("bucket", machine.instance)
-    points = []
+    points: list[Array] = []
     while plant.HasFrameNamed(f"{names.PROFILE}{len(points)}", machine.instance):
         frame = plant.GetFrameByName(f"{names.PROFILE}{len(points)}", machine.instance)
         points.append(frame.CalcPose(context, bucket).translation())
     corners = np.array(points)
     profile = corners[:, [0, 2]]
-    # Loose rock stands no steeper than about 45 degrees: a heap is at most half as high as the strike line is long.
+    # Loose rock stands at about 45 degrees at most: a heap's height is half of the strike line's length.
     strike = profile[-1] - profile[0]
     up = np.array([strike[1], -strike[0]]) / 2
     pieces = collision_pieces(plant, scene_graph, machine)["bucket"]
@@ -81,7 +82,7 @@ def calc_area(polygon: Array) -> float:
 
 
 def calc_heaped_capacity(bucket: BucketGeometry) -> float:
-    """Return the heaped capacity [m^3] after SAE J742: the struck volume and a heap of slope 1:2 on it."""
+    """Return the heaped capacity [m^3] after SAE J742: struck volume, and a heap of slope 1:2 on top."""
     width, length = bucket.inner_width, float(np.linalg.norm(bucket.profile[-1] - bucket.profile[0]))
     short, long = sorted((width, length))
     heap = short**2 * (3 * long - short) / 24
@@ -91,15 +92,22 @@ def calc_heaped_capacity(bucket: BucketGeometry) -> float:
 def collision_pieces(
     plant: MultibodyPlant, scene_graph: SceneGraph, machine: Machine
 ) -> dict[str, list[CollisionPiece]]:
-    """Return the machine's collision geometry as convex pieces by body name; round shapes become polyhedra."""
+    """Return the machine's contact shapes as convex pieces by body name, without the bucket's wear pads.
+
+    Round shapes become polyhedra: a tyre is 24 facets around and 5 rings across.
+    """
     inspector = scene_graph.model_inspector()
     pieces: dict[str, list[CollisionPiece]] = {}
     for index in plant.GetBodyIndices(machine.instance):
         body = plant.get_body(index)
         for geometry in plant.GetCollisionGeometriesForBody(body):
+            if inspector.GetName(geometry).split("::")[-1].startswith(names.PAD):
+                continue
             X_BG = inspector.GetPoseInFrame(geometry)
             vertices = _make_vertices(inspector, geometry)
-            friction = inspector.GetProximityProperties(geometry).GetProperty("material", "coulomb_friction")
+            friction: CoulombFriction = inspector.GetProximityProperties(geometry).GetProperty(
+                "material", "coulomb_friction"
+            )  # type: ignore[assignment]
             piece = CollisionPiece(
                 (X_BG.rotation().matrix() @ vertices.T).T + X_BG.translation(),
                 float(friction.dynamic_friction()),
@@ -108,7 +116,7 @@ def collision_pieces(
     return pieces
 
 
-def _make_vertices(inspector: SceneGraphInspector, geometry: object) -> Array:
+def _make_vertices(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
     shape: Shape = inspector.GetShape(geometry)
     if isinstance(shape, Convex | Mesh):
         hull = inspector.GetConvexHull(geometry)
@@ -118,7 +126,7 @@ def _make_vertices(inspector: SceneGraphInspector, geometry: object) -> Array:
     around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     if isinstance(shape, Cylinder):
         ring = np.column_stack([np.cos(around), np.sin(around), np.zeros(24)]) * shape.radius()
-        return np.vstack([ring + [0, 0, side * shape.length() / 2] for side in (-1, 1)])
+        return np.vstack([ring + np.array([0, 0, side * shape.length() / 2]) for side in (-1, 1)])
     if isinstance(shape, Ellipsoid | Sphere):
         radii = [shape.radius()] * 3 if isinstance(shape, Sphere) else [shape.a(), shape.b(), shape.c()]
         return np.vstack(

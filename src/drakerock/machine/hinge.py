@@ -12,14 +12,13 @@ from drakerock.machine.model import Machine
 
 
 class HingeMoment(LeafSystem):
-    """The bending and twisting moment in the bucket's hinge: the motor's axis excluded, unfiltered (section 5).
+    """The bending and twisting moment in the bucket's hinge, motor axis excluded, unfiltered (section 5).
 
     Input ports:
         reaction_forces: the plant's reaction_forces output.
     Output ports:
         moment: (1,) norm of the two components normal to the hinge axis, at the hinge's mid-point [N m].
-        components: (2,) moment about the bucket joint's x and z axis (twisting and yawing) on the bucket, expressed
-            in the joint's frame on the bucket [N m].
+        components: (2,) moment on the bucket about the x and z axis of the joint's frame on it [N m].
     """
 
     def __init__(self, plant: MultibodyPlant, machine: Machine) -> None:
@@ -31,7 +30,8 @@ class HingeMoment(LeafSystem):
 
     def _eval(self, context: Context) -> np.ndarray:
         # A revolute joint's axis is fixed in its frame; the machine's is the frame's y axis.
-        return self._forces.Eval(context)[self._joint].rotational()[[0, 2]]
+        force: SpatialForce = self._forces.Eval(context)[self._joint]  # type: ignore[index]
+        return force.rotational()[[0, 2]]
 
     def _calc_moment(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, float(np.linalg.norm(self._eval(context))))
@@ -42,7 +42,8 @@ class HingeMoment(LeafSystem):
 
 def add_hinge_moment(builder: DiagramBuilder, plant: MultibodyPlant, machine: Machine) -> HingeMoment:
     """Add a `HingeMoment` and connect it to the plant."""
-    system = builder.AddSystem(HingeMoment(plant, machine))
+    system = HingeMoment(plant, machine)
+    builder.AddSystem(system)
     system.set_name("hinge_moment")
     builder.Connect(plant.get_reaction_forces_output_port(), system.GetInputPort("reaction_forces"))
     return system

@@ -14,6 +14,7 @@ from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 from drakerock.errors import InputError
 from drakerock.machine import names
 from drakerock.machine.config import MachineConfig, MotorConfig
+from drakerock.machine.linkage import Loop, read_loops
 from drakerock.resources import find_data
 
 
@@ -34,6 +35,7 @@ class Machine:
         config: what it was made from.
         wheel, boom, bucket: limits of one wheel's, the boom's and the bucket's motor.
         steering_angle: angle held at the articulation [rad].
+        loops: the linkage's closed loops.
     """
 
     instance: ModelInstanceIndex
@@ -42,6 +44,7 @@ class Machine:
     boom: MotorLimits
     bucket: MotorLimits
     steering_angle: float
+    loops: tuple[Loop, ...]
 
 
 def add_machine(plant: MultibodyPlant, config: MachineConfig) -> Machine:
@@ -53,7 +56,7 @@ def add_machine(plant: MultibodyPlant, config: MachineConfig) -> Machine:
     Raises:
         InputError: no such file, an SDFormat error, or a name of `names` that is missing.
     """
-    instance = _parse(plant, config.model)
+    instance, loops = _parse(plant, config.model)
     _require_names(plant, instance, config.model)
 
     for name in ("articulation", "boom_joint", "bucket_joint", *names.WHEEL_JOINTS):
@@ -75,6 +78,7 @@ def add_machine(plant: MultibodyPlant, config: MachineConfig) -> Machine:
         boom=_apply_motor(plant, instance, "boom_joint", config.boom, config),
         bucket=_apply_motor(plant, instance, "bucket_joint", config.bucket, config),
         steering_angle=steering_angle,
+        loops=loops,
     )
 
 
@@ -105,18 +109,19 @@ def calc_motor_targets(
     return np.array(positions + [rates.get(name, wheel) for name in joints])
 
 
-def _parse(plant: MultibodyPlant, model: str) -> ModelInstanceIndex:
+def _parse(plant: MultibodyPlant, model: str) -> tuple[ModelInstanceIndex, tuple[Loop, ...]]:
     parser = Parser(plant)
     parser.package_map().AddPackageXml(str(find_data("sdf", "package.xml")))
-    if not model.startswith("package://") and not Path(model).is_file():
-        raise InputError(f"machine.model: {model}: no such file")
     try:
-        found = parser.AddModels(url=model) if model.startswith("package://") else parser.AddModels(model)
+        file = parser.package_map().ResolveUrl(model) if model.startswith("package://") else model
+        if not Path(file).is_file():
+            raise InputError(f"machine.model: {model}: no such file")
+        found = parser.AddModels(file)
     except RuntimeError as error:
         raise InputError(f"machine.model: {model}: {error}") from None
     if len(found) != 1:
         raise InputError(f"machine.model: {model}: expected one <model>, found {len(found)}")
-    return found[0]
+    return found[0], read_loops(file)
 
 
 def _require_names(plant: MultibodyPlant, instance: ModelInstanceIndex, model: str) -> None:

@@ -9,8 +9,44 @@ from pydrake.systems.framework import Context
 
 from drakerock.errors import InputError
 from drakerock.machine import names
-from drakerock.machine.kinematics import calc_bucket_range, calc_joint_angles, make_kinematics
+from drakerock.machine.kinematics import Kinematics, calc_bucket_range, calc_joint_angles, make_kinematics
+from drakerock.machine.linkage import Linkage
 from drakerock.machine.model import Machine
+
+
+def set_machine_angles(
+    plant: MultibodyPlant,
+    context: Context,
+    machine: Machine,
+    *,
+    phi_l: float,
+    phi_b: float,
+    kin: Kinematics | None = None,
+) -> None:
+    """Set boom, bucket and steering angle with the linkage closed behind them, and all joints at rest.
+
+    Args:
+        plant: the finalized plant.
+        context: the plant's context.
+        machine: the machine.
+        phi_l, phi_b: boom and bucket angle [rad].
+        kin: the machine's kinematics, if at hand: saves making it.
+
+    Raises:
+        InputError: an angle beyond a stop.
+    """
+    kin = kin or make_kinematics(plant, machine)
+    tilt, dump = calc_bucket_range(kin, phi_l)
+    if not (kin.phi_l_range[0] <= phi_l <= kin.phi_l_range[1] and tilt <= phi_b <= dump):
+        raise InputError(
+            f"the machine can't reach boom angle {np.degrees(phi_l):.1f} deg with bucket angle "
+            f"{np.degrees(phi_b):.1f} deg: boom {np.degrees(kin.phi_l_range).round(1)}, there the bucket "
+            f"{np.degrees([tilt, dump]).round(1)}"
+        )
+    linkage = Linkage(plant, context, machine.instance, machine.loops)
+    linkage.reset(*(float(angle) for angle in calc_joint_angles(kin, 0.0, 0.0)))
+    linkage.move(machine.steering_angle, phi_l, phi_b)
+    plant.SetVelocities(context, machine.instance, np.zeros(plant.num_velocities(machine.instance)))
 
 
 def set_machine_pose(
@@ -22,6 +58,7 @@ def set_machine_pose(
     y: float = 0.0,
     z_tip: float = 0.0,
     psi: float = 0.0,
+    kin: Kinematics | None = None,
 ) -> None:
     """Put the machine at rest on the floor z = 0, along +x, at its static equilibrium.
 
@@ -33,36 +70,28 @@ def set_machine_pose(
         x_tip, z_tip: where the bucket's tip is to be [m].
         y: of the machine's middle [m].
         psi: pitch of the bucket [rad], nose-up positive.
+        kin: the machine's kinematics, if at hand: saves making it.
 
     Raises:
         InputError: boom or bucket can't reach that pose.
     """
-    kin = make_kinematics(plant, machine)
-    instance = machine.instance
-    plant.SetPositions(context, instance, plant.GetDefaultPositions(instance))
-    plant.SetVelocities(context, instance, np.zeros(plant.num_velocities(instance)))
-    front = plant.GetBodyByName("front_unit", instance)
-    tip = plant.GetFrameByName("tip", instance)
-    boom = plant.GetJointByName("boom_joint", instance)
-    bucket = plant.GetJointByName("bucket_joint", instance)
-
-    sink, pitch, z_level, psi_level = 0.0, 0.0, z_tip, psi
-    for _ in range(4):
-        # The chassis' pitch and sink move the tip by millimetres: corrected by iteration.
-        phi_l, phi_b = (float(angle) for angle in calc_joint_angles(kin, z_level, psi_level))
-        low, high = calc_bucket_range(kin, phi_l)
-        if not (kin.phi_l_range[0] <= phi_l <= kin.phi_l_range[1] and low <= phi_b <= high):
+    kin = kin or make_kinematics(plant, machine)
+    front = plant.GetBodyByName("front_unit", machine.instance)
+    tip = plant.GetFrameByName("tip", machine.instance)
+    plant.SetPositions(context, machine.instance, plant.GetDefaultPositions(machine.instance))
+    sink, pitch, z_level = 0.0, 0.0, z_tip
+    for _ in range(3):
+        # Sink and pitch of the chassis on its tyres move the tip by millimetres: corrected by iteration.
+        phi_l, phi_b = (float(angle) for angle in calc_joint_angles(kin, z_level, psi + pitch))
+        if np.isnan(phi_l):
             raise InputError(f"the machine can't reach z_tip = {z_tip:.3f} m with psi = {psi:.3f} rad")
-        boom.set_angle(context, phi_l)
-        bucket.set_angle(context, phi_b)
-        X_WF = RigidTransform(RollPitchYaw(0, pitch, 0), [0, y, kin.wheel_radius - sink])
+        set_machine_angles(plant, context, machine, phi_l=phi_l, phi_b=phi_b, kin=kin)
+        X_WF = RigidTransform(RollPitchYaw(0, pitch, 0), np.array([0, y, kin.wheel_radius - sink]))
         plant.SetFreeBodyPose(context, front, X_WF)
         p_WT = tip.CalcPoseInWorld(context).translation()
-        plant.SetFreeBodyPose(
-            context, front, RigidTransform(X_WF.rotation(), X_WF.translation() + [x_tip - p_WT[0], 0, 0])
-        )
+        X_WF.set_translation(X_WF.translation() + np.array([x_tip - p_WT[0], 0, 0]))
+        plant.SetFreeBodyPose(context, front, X_WF)
         z_level += z_tip - p_WT[2]
-        psi_level = psi + pitch
         sink, pitch = _calc_equilibrium(plant, context, machine)
 
 

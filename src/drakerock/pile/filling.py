@@ -80,7 +80,7 @@ def fill(
     queue = np.asarray(waiting, np.int64)
     half = 0.5 * site.drift_width
     dt = engine.time_step
-    layer = START_SPEED * config.layer_interval + 0.5 * 9.81 * config.layer_interval**2
+    layer = START_SPEED * config.batch_time + 0.5 * 9.81 * config.batch_time**2
     time, next_layer, missed, last_check = 0.0, 0.0, 0, 0.0
     last_positions = pile.p_WRs
     while time < config.max_time:
@@ -94,7 +94,7 @@ def fill(
             velocities[:, 5] = -START_SPEED
             arrays = engine.place(arrays, chosen, places, velocities)
             queue = queue[~np.isin(queue, chosen)]
-            next_layer = time + config.layer_interval
+            next_layer = time + config.batch_time
         arrays, report = engine.advance(arrays)
         time += dt
         if on_step is not None:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drakerock.errors import InputError
+from drakerock.npz import load_arrays, save_arrays
 
 Array = NDArray[np.float64]
 FORMAT = "drakerock-pile"
@@ -169,25 +166,11 @@ def make_empty_pile() -> PileState:
 
 
 def save_pile(pile: PileState, path: str | Path) -> None:
-    """Write a pile as a versioned, compressed npz with a checksum.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a pile as a versioned npz with a checksum; InputError if the file cannot be written."""
     arrays = {name: getattr(pile, name) for name in _ARRAYS}
     if pile.contacts is not None:
         arrays |= {f"contact_{name}": getattr(pile.contacts, name) for name in _CONTACT_ARRAYS}
-    header = {
-        "format": FORMAT,
-        "version": VERSION,
-        "provenance": pile.provenance,
-        "checksum": _calc_checksum(arrays),
-    }
-    try:
-        with open(path, "wb") as file:
-            np.savez_compressed(file, header=np.array(json.dumps(header, sort_keys=True)), **arrays)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    save_arrays(path, FORMAT, VERSION, {"provenance": pile.provenance}, arrays)
 
 
 def load_pile(path: str | Path) -> PileState:
@@ -196,40 +179,10 @@ def load_pile(path: str | Path) -> PileState:
     Raises:
         InputError: missing, foreign, damaged, or of a newer version.
     """
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            header = json.loads(str(data["header"]))
-            if header.get("format") != FORMAT:
-                raise KeyError("format")
-            if header["version"] > VERSION:
-                raise InputError(
-                    f"{path}: pile format {header['version']} is newer than this version reads ({VERSION})"
-                )
-            arrays = {name: data[name] for name in data.files if name != "header"}
-        if _calc_checksum(arrays) != header["checksum"]:
-            raise InputError(f"{path}: damaged: the checksum does not match")
-        contacts = None
-        if "contact_pairs" in arrays:
-            contacts = ContactMemory(**{name: arrays[f"contact_{name}"] for name in _CONTACT_ARRAYS})
-        return PileState(
-            **{name: arrays[name] for name in _ARRAYS}, provenance=header["provenance"], contacts=contacts
-        )
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such pile file") from None
-    except InputError:
-        raise
-    except (KeyError, TypeError, AttributeError):
-        raise InputError(
-            f"{path}: not a drakerock pile (expected an .npz written by 'drakerock pile')"
-        ) from None
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise InputError(f"{path}: not a readable pile file: {error}") from None
-
-
-def _calc_checksum(arrays: dict[str, NDArray[Any]]) -> str:
-    digest = hashlib.sha256()
-    for name in (*_ARRAYS, *sorted(arrays.keys() - set(_ARRAYS))):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name}{array.dtype.str}{array.shape}".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
+    header, arrays = load_arrays(path, FORMAT, VERSION)
+    contacts = None
+    if "contact_pairs" in arrays:
+        contacts = ContactMemory(**{name: arrays[f"contact_{name}"] for name in _CONTACT_ARRAYS})
+    return PileState(
+        **{name: arrays[name] for name in _ARRAYS}, provenance=header["provenance"], contacts=contacts
+    )

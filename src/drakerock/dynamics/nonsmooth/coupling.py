@@ -26,6 +26,7 @@ from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 from pydrake.systems.framework import Context, LeafSystem, ValueProducer
 
 from drakerock.dynamics.nonsmooth import solver
+from drakerock.dynamics.nonsmooth.collision.geometry import make_tangents
 from drakerock.dynamics.nonsmooth.engine import MachinePiece, MachineStep, make_machineless_step
 from drakerock.dynamics.nonsmooth.solver import MachineArrays
 from drakerock.machine.geometry import collision_pieces
@@ -103,6 +104,12 @@ class MachineView(LeafSystem):
         self._stiction_tolerance = stiction_tolerance
         self._bodies = [plant.GetBodyByName(name, machine.instance) for name in layout.bodies]
         self._body_number = {int(body.index()): k for k, body in enumerate(self._bodies)}
+        self._loop_points = [
+            (plant.GetFrameByName(body, machine.instance), np.array(p))
+            for loop in machine.loops
+            for body, p in ((loop.body_A, loop.p_AP), (loop.body_B, loop.p_BQ))
+        ]
+        self._materials: dict[object, tuple[int | None, float, float]] = {}
         self._motors = _find_motors(plant, machine)
         self._stops = _find_stops(plant, machine)
         self._damping = _find_damping(plant)
@@ -137,8 +144,10 @@ class MachineView(LeafSystem):
         spatial = plant.CalcGravityGeneralizedForces(scratch)
         inverse = np.linalg.inv(inertia)
         free_change = h * inverse @ (generalised + spatial)
-
         world = plant.world_frame()
+        if self._loop_points:
+            inverse, free_change = self._close_loops(scratch, inverse, free_change, v)
+
         jacobian = np.array(
             [
                 plant.CalcJacobianSpatialVelocity(
@@ -175,6 +184,22 @@ class MachineView(LeafSystem):
                 sensor[None, :],
             )
         )
+
+    def _close_loops(
+        self, scratch: Context, inverse: Array, free_change: Array, v: Array
+    ) -> tuple[Array, Array]:
+        """Return inverse inertia and free change of velocity with the linkage's loops held closed."""
+        plant = self._plant
+        world = plant.world_frame()
+        points = [
+            plant.CalcJacobianTranslationalVelocity(scratch, JacobianWrtVariable.kV, frame, p, world, world)
+            for frame, p in self._loop_points
+        ]
+        rows = np.vstack(points[0::2]) - np.vstack(points[1::2])
+        response = inverse @ rows.T
+        # A plane linkage has rows that say nothing: the pseudo-inverse leaves them out.
+        hold = response @ np.linalg.pinv(rows @ response, rcond=1e-9, hermitian=True)
+        return inverse - hold @ response.T, free_change - hold @ (rows @ (v + free_change))
 
     def _make_motor_rows(
         self, desired: Array, positions: Array, n_v: int, h: float
@@ -214,35 +239,43 @@ class MachineView(LeafSystem):
         values: list[list[float]],
     ) -> None:
         """Add three rows per contact of a machine body with the site: tyres on the floor, above all."""
-        inspector = query.inspector()
         for pair in query.ComputePointPairPenetration():
-            side, number = 1.0, self._find_body(inspector, pair.id_A)
-            other = pair.id_B
-            if number is None:
-                side, number = -1.0, self._find_body(inspector, pair.id_B)
-                other = pair.id_A
-            if number is None or self._find_body(inspector, other) is not None:
+            body_A, stiffness_A, mu_A = self._find_material(query, pair.id_A)
+            body_B, stiffness_B, mu_B = self._find_material(query, pair.id_B)
+            if (body_A is None) == (body_B is None):
                 continue
             # nhat_BA_W points out of B into A
-            normal = side * np.asarray(pair.nhat_BA_W)
-            point = 0.5 * (np.asarray(pair.p_WCa) + np.asarray(pair.p_WCb))
-            own, site = (pair.id_A, pair.id_B) if side > 0 else (pair.id_B, pair.id_A)
-            stiffness, mu = _combine_materials(inspector, own, site)
-            J = _calc_point_jacobian(jacobian[number], point - X_WBs[number][:3, 3])
-            tangent = np.cross(normal, [0.0, 1.0, 0.0] if abs(normal[1]) < 0.9 else [1.0, 0.0, 0.0])
-            tangent /= np.linalg.norm(tangent)
+            normal = np.asarray(pair.nhat_BA_W)
+            number = body_A
+            if number is None:
+                normal, number = -normal, body_B
+            stiffness = stiffness_A * stiffness_B / (stiffness_A + stiffness_B)
+            mu = 2.0 * mu_A * mu_B / (mu_A + mu_B)
+            arm = 0.5 * (np.asarray(pair.p_WCa) + np.asarray(pair.p_WCb)) - X_WBs[number][:3, 3]
+            J = jacobian[number, 3:] - _make_cross(arm) @ jacobian[number, :3]
+            tx, ty, tz, ux, uy, uz = make_tangents(*normal)
+            directions = np.array([normal, [tx, ty, tz], [ux, uy, uz]])
             first = len(rows)
             load = h * stiffness * pair.depth
-            rows.append(normal @ J)
+            # Drake's regularised friction is full at the stiction tolerance.
+            friction = [0.0, self._stiction_tolerance / (mu * load), -mu, mu, first]
+            rows.extend(directions @ J)
             values.append([pair.depth / h, 1.0 / (h * h * stiffness), 0.0, np.inf, -1])
-            for direction in (tangent, np.cross(normal, tangent)):
-                rows.append(direction @ J)
-                # Drake's regularised friction: full at the stiction tolerance
-                values.append([0.0, self._stiction_tolerance / (mu * load), -mu, mu, first])
+            values.extend([friction, friction])
 
-    def _find_body(self, inspector: object, geometry: object) -> int | None:
-        body = self._plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))  # type: ignore[attr-defined]
-        return self._body_number.get(int(body.index()))
+    def _find_material(self, query: QueryObject, geometry: object) -> tuple[int | None, float, float]:
+        """Return a geometry's body number (None: not the machine's), point stiffness [N/m] and friction."""
+        if geometry not in self._materials:
+            # Looked up once per geometry: it follows from the finalized plant alone.
+            inspector = query.inspector()
+            body = self._plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
+            properties = inspector.GetProximityProperties(geometry)
+            self._materials[geometry] = (
+                self._body_number.get(int(body.index())),
+                properties.GetPropertyOrDefault("material", "point_contact_stiffness", 1e8),
+                properties.GetProperty("material", "coulomb_friction").dynamic_friction(),
+            )
+        return self._materials[geometry]
 
 
 @dataclass(frozen=True)
@@ -300,20 +333,6 @@ def _find_damping(plant: MultibodyPlant) -> Array:
     return damping
 
 
-def _combine_materials(inspector: object, own: object, site: object) -> tuple[float, float]:
-    """Return the contact stiffness [N/m] (in series) and friction of two geometries, as Drake combines them."""
-    stiffness, friction = [], []
-    for geometry in (own, site):
-        properties = inspector.GetProximityProperties(geometry)  # type: ignore[attr-defined]
-        stiffness.append(properties.GetPropertyOrDefault("material", "point_contact_stiffness", 1e8))
-        friction.append(properties.GetProperty("material", "coulomb_friction").dynamic_friction())
-    a, b = friction
-    return stiffness[0] * stiffness[1] / (stiffness[0] + stiffness[1]), 2.0 * a * b / (a + b)
-
-
-def _calc_point_jacobian(jacobian: Array, arm: Array) -> Array:
-    """Return (3, v): the velocity of the point at `arm` from a body's origin, from its spatial Jacobian."""
+def _make_cross(arm: Array) -> Array:
     x, y, z = arm
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    result: Array = jacobian[3:] - cross @ jacobian[:3]
-    return result
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -417,11 +417,10 @@ class NonsmoothEngine:
             )
         status = book[:, reduction.STATUS].astype(np.int64)
         awake = np.flatnonzero(status == AWAKE)
+        self._velocities[:n] = arrays.velocities
+        self._velocities[n + 1 :] = machine.arrays.jacobian @ machine.velocity
         self._pose(arrays, machine, awake)
         motion.set_bodies(awake, arrays.velocities, self.inverse_mass, self._inverse_inertia, self._bodies)
-        self._velocities[:n] = arrays.velocities
-        for k in range(self.n_machine_bodies):
-            self._velocities[n + 1 + k] = machine.arrays.jacobian[k] @ machine.velocity
 
         n_pairs = self._find_pairs(status, awake)
         contacts.index_memory(memory, arrays.n_memory, self._table)
@@ -506,18 +505,10 @@ class NonsmoothEngine:
             self.inverse_inertia_local, self._inverse_inertia,
         )  # fmt: skip
         self._posed = poses
-        for k, body in enumerate(self.piece_body):
-            j = self.first_piece + k
-            X_WB = machine.X_WBs[body]
-            V_WB = machine.arrays.jacobian[body] @ machine.velocity
-            vertices = self._get_vertices(self.shape[j]) @ X_WB[:3, :3].T
-            # The box covers the way of every corner over the step.
-            ahead = vertices + dt * (V_WB[3:] + np.cross(V_WB[:3], vertices))
-            both = np.vstack([vertices, ahead]) + X_WB[:3, 3]
-            self._positions[j] = X_WB[:3, 3]
-            self._rotations[j] = X_WB[:3, :3]
-            self._lower[j] = both.min(axis=0) - margin
-            self._upper[j] = both.max(axis=0) + margin
+        broad_phase.calc_piece_boxes(
+            self.first_piece, self.piece_body, self.shape, self.convex, machine.X_WBs,
+            self._velocities[n + 1 :], dt, margin, self._positions, self._rotations, self._lower, self._upper,
+        )  # fmt: skip
 
     def _find_pairs(self, status: IntArray, awake: IntArray) -> int:
         n = self.n_rocks

@@ -54,8 +54,10 @@ class _Step:
 class NonsmoothRocks(LeafSystem):
     """All rocks of a pile, stepped by the nonsmooth engine (`RockSystem`).
 
-    One solve per step: a cache entry computed from the state at t_n, read by the discrete update and by the
-    output ports alike. All state is discrete and numeric, the contact memory and the bookkeeping of the
+    One solve per step: a cache entry computed from the state at t_n, read by the discrete update and by
+    ``spatial_forces`` alike. ``rock_summary`` and ``F_B_W`` are state, so that reading them solves nothing: they
+    belong to the step taken last (a log written at t_n after the update holds the step that starts at t_n). All
+    state is discrete and numeric, the contact memory and the bookkeeping of the
     reduction included, so a context can be saved, restored and repeated bit for bit. The engine's scratch
     memory is shared by all contexts: one thread at a time.
 
@@ -93,7 +95,7 @@ class NonsmoothRocks(LeafSystem):
         n = engine.n_rocks
         arrays = engine.make_arrays(pile)
         self._groups = {
-            name: self.DeclareDiscreteState(values) for name, values in _flatten(arrays, 0.0).items()
+            name: self.DeclareDiscreteState(values) for name, values in _flatten(arrays).items()
         }
         self._machine = self.DeclareAbstractInputPort(
             "machine_step", Value[object](make_machineless_step())
@@ -105,17 +107,16 @@ class NonsmoothRocks(LeafSystem):
         )
         self._step = step
         state_only = {self.xd_ticket()}
-        solved = {step.ticket()}
         self.DeclareVectorOutputPort("rock_poses", 7 * n, self._calc_poses, state_only)
         self.DeclareVectorOutputPort("rock_velocities", 6 * n, self._calc_velocities, state_only)
         self.DeclareVectorOutputPort("rock_status", n, self._calc_status, state_only)
-        self.DeclareVectorOutputPort("rock_summary", len(ROCK_SUMMARY), self._calc_summary, solved)
-        self.DeclareVectorOutputPort("F_B_W", 6, self._calc_bucket_force, solved)
+        self.DeclareVectorOutputPort("rock_summary", len(ROCK_SUMMARY), self._calc_summary, state_only)
+        self.DeclareVectorOutputPort("F_B_W", 6, self._calc_bucket_force, state_only)
         self.DeclareAbstractOutputPort(
             "spatial_forces",
             lambda: Value[list[ExternallyAppliedSpatialForce]]([]),
             self._calc_spatial_forces,
-            solved,
+            {step.ticket()},
         )
         self.DeclarePeriodicDiscreteUpdateEvent(engine.time_step, 0.0, self._update)
 
@@ -131,7 +132,7 @@ class NonsmoothRocks(LeafSystem):
             ValueError: not the rocks this system was made for.
         """
         context = self.GetMyMutableContextFromRoot(root_context)
-        for name, values in _flatten(self._engine.make_arrays(pile), 0.0).items():
+        for name, values in _flatten(self._engine.make_arrays(pile)).items():
             context.SetDiscreteState(self._groups[name], values)
 
     def get_pile(self, root_context: Context) -> PileState:
@@ -165,9 +166,20 @@ class NonsmoothRocks(LeafSystem):
 
     def _update(self, context: Context, discrete: DiscreteValues) -> None:
         step: _Step = self._step.Eval(context)
-        lost = context.get_discrete_state(self._groups["counts"]).value()[1] + step.report.n_lost
-        for name, values in _flatten(step.arrays, lost).items():
-            discrete.set_value(self._groups[name], values)
+        report = step.report
+        last = context.get_discrete_state(self._groups["report"]).value()
+        F_B_W = np.zeros(6) if self._layout is None else report.F_Bs_W[self._layout.bucket]
+        values = {
+            "n_awake": report.n_awake,
+            "n_contacts": report.n_contacts,
+            "penetration_max": report.max_penetration,
+            "penetration_p99": report.p99_penetration,
+            "residual": report.residual,
+            "n_lost": last[_N_LOST] + report.n_lost,
+        }
+        summary = [float(values[name]) for name in ROCK_SUMMARY]
+        for name, flat in _flatten(step.arrays, np.concatenate([summary, F_B_W])).items():
+            discrete.set_value(self._groups[name], flat)
 
     def _calc_poses(self, context: Context, output: BasicVector) -> None:
         arrays = self._get_arrays(context)
@@ -180,20 +192,10 @@ class NonsmoothRocks(LeafSystem):
         output.SetFromVector(self._get_arrays(context).book[:, reduction.STATUS])
 
     def _calc_summary(self, context: Context, output: BasicVector) -> None:
-        report: StepReport = self._step.Eval(context).report
-        values = {
-            "n_awake": report.n_awake,
-            "n_contacts": report.n_contacts,
-            "penetration_max": report.max_penetration,
-            "penetration_p99": report.p99_penetration,
-            "residual": report.residual,
-            "n_lost": context.get_discrete_state(self._groups["counts"]).value()[1] + report.n_lost,
-        }
-        output.SetFromVector([values[name] for name in ROCK_SUMMARY])
+        output.SetFromVector(context.get_discrete_state(self._groups["report"]).value()[: len(ROCK_SUMMARY)])
 
     def _calc_bucket_force(self, context: Context, output: BasicVector) -> None:
-        report: StepReport = self._step.Eval(context).report
-        output.SetFromVector(np.zeros(6) if self._layout is None else report.F_Bs_W[self._layout.bucket])
+        output.SetFromVector(context.get_discrete_state(self._groups["report"]).value()[len(ROCK_SUMMARY) :])
 
     def _calc_spatial_forces(self, context: Context, output: Value) -> None:
         report: StepReport = self._step.Eval(context).report
@@ -208,14 +210,18 @@ class NonsmoothRocks(LeafSystem):
         output.set_value(forces)
 
 
-def _flatten(arrays: RockArrays, n_lost: float) -> dict[str, Array]:
+_N_LOST = list(ROCK_SUMMARY).index("n_lost")
+
+
+def _flatten(arrays: RockArrays, report: Array | None = None) -> dict[str, Array]:
     return {
         "quaternions": arrays.quaternions.reshape(-1),
         "positions": arrays.positions.reshape(-1),
         "velocities": arrays.velocities.reshape(-1),
         "book": arrays.book.reshape(-1),
         "memory": arrays.memory.reshape(-1),
-        "counts": np.array([float(arrays.n_memory), n_lost]),
+        "counts": np.array([float(arrays.n_memory)]),
+        "report": np.zeros(len(ROCK_SUMMARY) + 6) if report is None else report,
     }
 
 

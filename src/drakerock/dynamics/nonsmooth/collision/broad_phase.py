@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from drakerock.dynamics.nonsmooth.collision.geometry import get_corner, get_rotation
 from drakerock.dynamics.nonsmooth.compiling import kernel
 
 # How a rock is treated.
@@ -207,3 +208,33 @@ def rotate_inertia(r, local, world, i):
     world[i, 3] = m10 * r[3] + m11 * r[4] + m12 * r[5]
     world[i, 4] = m10 * r[6] + m11 * r[7] + m12 * r[8]
     world[i, 5] = m20 * r[6] + m21 * r[7] + m22 * r[8]
+
+
+@kernel
+def calc_piece_boxes(first, piece_body, shape, shapes, X_WBs, V_WBs, sweep, margin, positions, rotations, lower, upper):
+    """Set poses and bounding boxes of the machine's pieces; a box covers the way of every corner over a step.
+
+    Args:
+        first: index of the first piece among the bodies.
+        piece_body: (k,) body of the machine that each piece belongs to.
+        shape: per body, its shape; shapes: all shapes.
+        X_WBs, V_WBs: (b, 4, 4) poses and (b, 6) spatial velocities of the machine's bodies.
+        sweep, margin: as for `calc_poses`.
+        positions, rotations, lower, upper: per body, set.
+    """
+    for k in range(len(piece_body)):
+        i, b = first + k, piece_body[k]
+        for d in range(3):
+            positions[i, d] = X_WBs[b, d, 3]
+            lower[i, d], upper[i, d] = np.inf, -np.inf
+            for e in range(3):
+                rotations[i, d, e] = X_WBs[b, d, e]
+        r = get_rotation(rotations, i)
+        for corner in range(shapes.vertex_start[shape[i]], shapes.vertex_start[shape[i] + 1]):
+            x, y, z = get_corner(shapes, corner, 1.0, r)
+            vx = V_WBs[b, 3] + V_WBs[b, 1] * z - V_WBs[b, 2] * y
+            vy = V_WBs[b, 4] + V_WBs[b, 2] * x - V_WBs[b, 0] * z
+            vz = V_WBs[b, 5] + V_WBs[b, 0] * y - V_WBs[b, 1] * x
+            for d, (here, way) in enumerate(((x, sweep * vx), (y, sweep * vy), (z, sweep * vz))):
+                lower[i, d] = min(lower[i, d], positions[i, d] + here + min(way, 0.0) - margin)
+                upper[i, d] = max(upper[i, d], positions[i, d] + here + max(way, 0.0) + margin)
