@@ -62,7 +62,7 @@ def make_still_machine(pose, n_bodies=1):
         np.zeros(1),
         np.zeros(1),
         MachineArrays(
-            np.zeros((n_bodies, 6, 1)), np.zeros((n_bodies, 1, 6)), np.zeros((0, 1)), np.zeros((0, 1)),
+            np.zeros((n_bodies, 6, 1)), np.zeros((n_bodies, 1, 6)), np.zeros((n_bodies, 6, 6)), np.zeros((0, 1)), np.zeros((0, 1)),
             np.zeros((0, MACHINE_ROW_WIDTH)),
         ),
         np.zeros((0, 18)),

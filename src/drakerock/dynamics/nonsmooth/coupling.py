@@ -179,7 +179,12 @@ class MachineView(LeafSystem):
                 v,
                 free_change,
                 MachineArrays(
-                    np.ascontiguousarray(jacobian), response, row_array, row_response, row_values
+                    np.ascontiguousarray(jacobian),
+                    response,
+                    np.ascontiguousarray(jacobian @ response),
+                    row_array,
+                    row_response,
+                    row_values,
                 ),
                 sensor[None, :],
             )

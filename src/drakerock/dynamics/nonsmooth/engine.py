@@ -133,6 +133,7 @@ def make_machineless_step() -> MachineStep:
         MachineArrays(
             np.zeros((0, 6, 0)),
             np.zeros((0, 0, 6)),
+            np.zeros((0, 6, 6)),
             np.zeros((0, 0)),
             np.zeros((0, 0)),
             np.zeros((0, solver.MACHINE_ROW_WIDTH)),

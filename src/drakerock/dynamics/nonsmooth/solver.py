@@ -64,6 +64,7 @@ class MachineArrays(NamedTuple):
     Attributes:
         jacobian: (b, 6, v) spatial velocity of each body at its origin in W: angular, translational.
         response: (b, v, 6) change of the generalised velocities by an impulse on each body at its origin.
+        mobility: (b, 6, 6) change of each body's spatial velocity by an impulse on itself at its origin.
         rows: (m, v) what each row measures.
         row_response: (m, v) change of the generalised velocities by a unit of each row's impulse.
         row_values: (m, MACHINE_ROW_WIDTH): velocity aimed at, compliance, least and greatest impulse,
@@ -73,6 +74,7 @@ class MachineArrays(NamedTuple):
 
     jacobian: NDArray[np.float64]
     response: NDArray[np.float64]
+    mobility: NDArray[np.float64]
     rows: NDArray[np.float64]
     row_response: NDArray[np.float64]
     row_values: NDArray[np.float64]
@@ -101,35 +103,23 @@ def _push(body, rx, ry, rz, px, py, pz, sign):
 
 
 @kernel
-def _push_machine(machine, velocity, b, rx, ry, rz, px, py, pz):
-    """Change the machine's velocities by an impulse p on its body b at arm r."""
-    tx, ty, tz = ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px
+def _push_machine(machine, velocity, b, impulse):
+    """Change the machine's velocities by a spatial impulse (6,) on its body b at its origin."""
     response = machine.response[b]
     for k in range(len(velocity)):
-        velocity[k] += (
-            response[k, 0] * tx
-            + response[k, 1] * ty
-            + response[k, 2] * tz
-            + response[k, 3] * px
-            + response[k, 4] * py
-            + response[k, 5] * pz
-        )
+        for d in range(6):
+            velocity[k] += response[k, d] * impulse[d]
 
 
 @kernel
-def _calc_point_velocity(machine, velocity, b, rx, ry, rz):
-    """Return the velocity of the machine's body b at arm r."""
-    wx = wy = wz = vx = vy = vz = 0.0
+def _calc_body_velocity(machine, velocity, b, spatial):
+    """Set the spatial velocity (6,) of the machine's body b at its origin."""
     jacobian = machine.jacobian[b]
-    for k in range(len(velocity)):
-        u = velocity[k]
-        wx += jacobian[0, k] * u
-        wy += jacobian[1, k] * u
-        wz += jacobian[2, k] * u
-        vx += jacobian[3, k] * u
-        vy += jacobian[4, k] * u
-        vz += jacobian[5, k] * u
-    return vx + wy * rz - wz * ry, vy + wz * rx - wx * rz, vz + wx * ry - wy * rx
+    for d in range(6):
+        total = 0.0
+        for k in range(len(velocity)):
+            total += jacobian[d, k] * velocity[k]
+        spatial[d] = total
 
 
 @kernel
@@ -149,22 +139,20 @@ def _add_mobility(body, rx, ry, rz, mobility):
 
 
 @kernel
-def _add_machine_mobility(machine, b, rx, ry, rz, mobility, scratch):
-    """Add the point mobility of the machine's body b."""
-    for axis in range(3):
-        px, py, pz = 1.0 * (axis == 0), 1.0 * (axis == 1), 1.0 * (axis == 2)
-        scratch[:] = 0.0
-        _push_machine(machine, scratch, b, rx, ry, rz, px, py, pz)
-        vx, vy, vz = _calc_point_velocity(machine, scratch, b, rx, ry, rz)
-        if axis == 0:
-            mobility[0] += vx
-        elif axis == 1:
-            mobility[1] += vx
-            mobility[3] += vy
-        else:
-            mobility[2] += vx
-            mobility[4] += vy
-            mobility[5] += vz
+def _add_machine_mobility(m, rx, ry, rz, mobility):
+    """Add the mobility at arm r of a machine body with the spatial mobility m (6, 6)."""
+    # P m P^T with P = (-[r]x, 1), the map from a spatial velocity to the point's velocity
+    p = ((0.0, rz, -ry), (-rz, 0.0, rx), (ry, -rx, 0.0))
+    place = 0
+    for i in range(3):
+        for j in range(i, 3):
+            total = m[3 + i, 3 + j]
+            for k in range(3):
+                total += p[i][k] * m[k, 3 + j] + m[3 + i, k] * p[j][k]
+                for n in range(3):
+                    total += p[i][k] * m[k, n] * p[j][n]
+            mobility[place] += total
+            place += 1
 
 
 @kernel
@@ -190,13 +178,14 @@ def _relative_velocity(row, body_a, body_b):
 
 
 @kernel
-def _relative_velocity_machine(row, body_a, machine, velocity, b):
-    vx, vy, vz = _calc_point_velocity(machine, velocity, b, row[ARM_B], row[ARM_B + 1], row[ARM_B + 2])
+def _relative_velocity_machine(row, body_a, spatial):
+    """Return the velocity of a point of a machine body, of spatial velocity (6,), against A's."""
+    bx, by, bz = row[ARM_B], row[ARM_B + 1], row[ARM_B + 2]
     ax, ay, az = row[ARM_A], row[ARM_A + 1], row[ARM_A + 2]
     return (
-        vx - body_a[3] + (body_a[2] * ay - body_a[1] * az),
-        vy - body_a[4] + (body_a[0] * az - body_a[2] * ax),
-        vz - body_a[5] + (body_a[1] * ax - body_a[0] * ay),
+        spatial[3] - body_a[3] + (spatial[1] * bz - spatial[2] * by) + (body_a[2] * ay - body_a[1] * az),
+        spatial[4] - body_a[4] + (spatial[2] * bx - spatial[0] * bz) + (body_a[0] * az - body_a[2] * ax),
+        spatial[5] - body_a[5] + (spatial[0] * by - spatial[1] * bx) + (body_a[1] * ax - body_a[0] * ay),
     )
 
 
@@ -219,17 +208,20 @@ def prepare_rows(
         impact_threshold: what approaches faster is an impact [m/s].
     """
     mobility = np.zeros(6)
-    scratch = np.zeros(len(velocity))
+    spatial = np.zeros((len(machine.jacobian), 6))
+    for b in range(len(spatial)):
+        _calc_body_velocity(machine, velocity, b, spatial[b])
     for k in range(n_rows):
         row = rows[k]
         a, b = body_a[k], body_b[k]
         mobility[:] = 0.0
         _add_mobility(bodies[a], row[ARM_A], row[ARM_A + 1], row[ARM_A + 2], mobility)
         if b > n_rocks:
+            number = b - n_rocks - 1
             _add_machine_mobility(
-                machine, b - n_rocks - 1, row[ARM_B], row[ARM_B + 1], row[ARM_B + 2], mobility, scratch
+                machine.mobility[number], row[ARM_B], row[ARM_B + 1], row[ARM_B + 2], mobility
             )
-            dx, dy, dz = _relative_velocity_machine(row, bodies[a], machine, velocity, b - n_rocks - 1)
+            dx, dy, dz = _relative_velocity_machine(row, bodies[a], spatial[number])
         else:
             _add_mobility(bodies[b], row[ARM_B], row[ARM_B + 1], row[ARM_B + 2], mobility)
             dx, dy, dz = _relative_velocity(row, bodies[a], bodies[b])
@@ -315,23 +307,61 @@ def _solve_row(row, dx, dy, dz):
 
 
 @kernel
-def _solve_contact(row, a, b, bodies, n_rocks, machine, velocity):
-    """Update one contact and the bodies' velocities; return the change of its normal impulse."""
-    one = bodies[a]
-    if b > n_rocks:
-        dx, dy, dz = _relative_velocity_machine(row, one, machine, velocity, b - n_rocks - 1)
-    else:
-        dx, dy, dz = _relative_velocity(row, one, bodies[b])
+def _solve_contact(row, body_a, body_b):
+    """Update one contact and its two rocks' velocities; return the change of its normal impulse."""
+    dx, dy, dz = _relative_velocity(row, body_a, body_b)
     px, py, pz, change = _solve_row(row, dx, dy, dz)
     if px != 0.0 or py != 0.0 or pz != 0.0:
-        _push(one, row[ARM_A], row[ARM_A + 1], row[ARM_A + 2], px, py, pz, -1.0)
-        if b > n_rocks:
-            _push_machine(
-                machine, velocity, b - n_rocks - 1, row[ARM_B], row[ARM_B + 1], row[ARM_B + 2], px, py, pz
-            )
-        else:
-            _push(bodies[b], row[ARM_B], row[ARM_B + 1], row[ARM_B + 2], px, py, pz, 1.0)
+        _push(body_a, row[ARM_A], row[ARM_A + 1], row[ARM_A + 2], px, py, pz, -1.0)
+        _push(body_b, row[ARM_B], row[ARM_B + 1], row[ARM_B + 2], px, py, pz, 1.0)
     return change
+
+
+@kernel
+def _solve_machine_contacts(rows, order, body_a, body_b, bodies, n_rocks, machine, velocity):
+    """Update the machine's contacts in `order`; return the sum of the changes of their normal impulses.
+
+    Contacts of one body in line share its spatial velocity; the whole machine is told when the body changes.
+    """
+    spatial, impulse, point = np.zeros(6), np.zeros(6), np.zeros(6)
+    current = -1
+    changed = 0.0
+    for c in range(len(order)):
+        k = order[c]
+        row = rows[k]
+        number = body_b[k] - n_rocks - 1
+        if number != current:
+            if current >= 0:
+                _push_machine(machine, velocity, current, impulse)
+            impulse[:] = 0.0
+            current = number
+            _calc_body_velocity(machine, velocity, current, spatial)
+        one = bodies[body_a[k]]
+        dx, dy, dz = _relative_velocity_machine(row, one, spatial)
+        px, py, pz, change = _solve_row(row, dx, dy, dz)
+        changed += abs(change)
+        if px != 0.0 or py != 0.0 or pz != 0.0:
+            _push(one, row[ARM_A], row[ARM_A + 1], row[ARM_A + 2], px, py, pz, -1.0)
+            rx, ry, rz = row[ARM_B], row[ARM_B + 1], row[ARM_B + 2]
+            point[0], point[1], point[2] = ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px
+            point[3], point[4], point[5] = px, py, pz
+            mobility = machine.mobility[current]
+            for d in range(6):
+                impulse[d] += point[d]
+                for e in range(6):
+                    spatial[d] += mobility[d, e] * point[e]
+    if current >= 0:
+        _push_machine(machine, velocity, current, impulse)
+    return changed
+
+
+@kernel
+def _find_machine_rows(n_rows, body_b, n_rocks):
+    """Return the first of the machine's contacts; they are the last rows."""
+    first = n_rows
+    while first > 0 and body_b[first - 1] > n_rocks:
+        first -= 1
+    return first
 
 
 @kernel
@@ -361,29 +391,31 @@ def _solve_machine_rows(machine, velocity):
 @kernel
 def apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity):
     """Apply the impulses that the rows hold (the warm start) to all bodies."""
+    point = np.zeros(6)
     for k in range(n_rows):
         row = rows[k]
         if row[IMPULSE] == 0.0:
             continue
-        px = row[IMPULSE] * row[NORMAL] + row[IMPULSE + 1] * row[TANGENT_1] + row[IMPULSE + 2] * row[TANGENT_2]
-        py = (
-            row[IMPULSE] * row[NORMAL + 1]
-            + row[IMPULSE + 1] * row[TANGENT_1 + 1]
-            + row[IMPULSE + 2] * row[TANGENT_2 + 1]
-        )
-        pz = (
-            row[IMPULSE] * row[NORMAL + 2]
-            + row[IMPULSE + 1] * row[TANGENT_1 + 2]
-            + row[IMPULSE + 2] * row[TANGENT_2 + 2]
-        )
+        px, py, pz = _calc_impulse(row)
         _push(bodies[body_a[k]], row[ARM_A], row[ARM_A + 1], row[ARM_A + 2], px, py, pz, -1.0)
-        b = body_b[k]
-        if b > n_rocks:
-            _push_machine(
-                machine, velocity, b - n_rocks - 1, row[ARM_B], row[ARM_B + 1], row[ARM_B + 2], px, py, pz
-            )
+        rx, ry, rz = row[ARM_B], row[ARM_B + 1], row[ARM_B + 2]
+        if body_b[k] > n_rocks:
+            point[0], point[1], point[2] = ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px
+            point[3], point[4], point[5] = px, py, pz
+            _push_machine(machine, velocity, body_b[k] - n_rocks - 1, point)
         else:
-            _push(bodies[b], row[ARM_B], row[ARM_B + 1], row[ARM_B + 2], px, py, pz, 1.0)
+            _push(bodies[body_b[k]], rx, ry, rz, px, py, pz, 1.0)
+
+
+@kernel
+def _calc_impulse(row):
+    """Return a row's impulse in W."""
+    normal, one, two = row[IMPULSE], row[IMPULSE + 1], row[IMPULSE + 2]
+    return (
+        normal * row[NORMAL] + one * row[TANGENT_1] + two * row[TANGENT_2],
+        normal * row[NORMAL + 1] + one * row[TANGENT_1 + 1] + two * row[TANGENT_2 + 1],
+        normal * row[NORMAL + 2] + one * row[TANGENT_1 + 2] + two * row[TANGENT_2 + 2],
+    )
 
 
 @kernel
@@ -391,7 +423,7 @@ def solve_resting(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, veloci
     """The resting stage: `iterations` symmetric sweeps, forwards and backwards in turn.
 
     Args:
-        rows, n_rows, body_a, body_b: prepared contact rows.
+        rows, n_rows, body_a, body_b: prepared contact rows; the machine's are the last.
         bodies, machine, velocity: with gravity, free velocities and warm start applied; changed.
         n_rocks: see `prepare_rows`.
         iterations: number of sweeps.
@@ -399,17 +431,26 @@ def solve_resting(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, veloci
     Returns:
         the residual: the last sweep's change of the normal impulses over their sum.
     """
+    n_free = _find_machine_rows(n_rows, body_b, n_rocks)
+    forwards = np.arange(n_free, n_rows)
+    backwards = forwards[::-1].copy()
     changed = 0.0
     for iteration in range(iterations):
         if len(machine.row_values) > 0:
             _solve_machine_rows(machine, velocity)
         changed = 0.0
         if iteration % 2 == 0:
-            for k in range(n_rows):
-                changed += abs(_solve_contact(rows[k], body_a[k], body_b[k], bodies, n_rocks, machine, velocity))
+            for k in range(n_free):
+                changed += abs(_solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]]))
+            changed += _solve_machine_contacts(
+                rows, forwards, body_a, body_b, bodies, n_rocks, machine, velocity
+            )
         else:
-            for k in range(n_rows - 1, -1, -1):
-                changed += abs(_solve_contact(rows[k], body_a[k], body_b[k], bodies, n_rocks, machine, velocity))
+            changed += _solve_machine_contacts(
+                rows, backwards, body_a, body_b, bodies, n_rocks, machine, velocity
+            )
+            for k in range(n_free - 1, -1, -1):
+                changed += abs(_solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]]))
     total = 0.0
     for k in range(n_rows):
         total += rows[k, IMPULSE]
@@ -427,27 +468,32 @@ def solve_impacts(
     their own, the resting stage stops them.
 
     Args:
-        rows: before `prepare_rows` set biases; their impulses are left as they were.
+        rows, n_rows, body_a, body_b: prepared; biases and impulses are left as they were.
         bodies, machine, velocity: at the velocities before the step; changed by the impacts.
+        n_rocks: see `prepare_rows`.
+        time_step: [s].
         threshold: [m/s].
+        iterations: number of sweeps.
         marks: (bodies of the solve,) scratch.
-        impact_impulses: (rows, 3) set: impulses in W of the impacts [N s].
+        impact_impulses: (rows, 3) set if there are impacts: their impulses in W [N s].
 
     Returns:
         the number of impacts.
     """
+    spatial = np.zeros((len(machine.jacobian), 6))
+    for b in range(len(spatial)):
+        _calc_body_velocity(machine, velocity, b, spatial[b])
+    approach = np.empty(n_rows)
     n_impacts = 0
     for k in range(n_rows):
         row = rows[k]
-        if row[RESTITUTION] <= 0.0:
-            continue
         b = body_b[k]
         if b > n_rocks:
-            dx, dy, dz = _relative_velocity_machine(row, bodies[body_a[k]], machine, velocity, b - n_rocks - 1)
+            dx, dy, dz = _relative_velocity_machine(row, bodies[body_a[k]], spatial[b - n_rocks - 1])
         else:
             dx, dy, dz = _relative_velocity(row, bodies[body_a[k]], bodies[b])
-        approach = row[NORMAL] * dx + row[NORMAL + 1] * dy + row[NORMAL + 2] * dz
-        if approach < -threshold and row[GAP] + time_step * approach < 0.0:
+        approach[k] = row[NORMAL] * dx + row[NORMAL + 1] * dy + row[NORMAL + 2] * dz
+        if row[RESTITUTION] > 0.0 and approach[k] < -threshold and row[GAP] + time_step * approach[k] < 0.0:
             if n_impacts == 0:
                 marks[:] = 0
             marks[body_a[k]] = 1
@@ -457,46 +503,44 @@ def solve_impacts(
     if n_impacts == 0:
         return 0
     chosen = np.empty(n_rows, np.int64)
+    saved = np.empty((n_rows, 6))
     n_chosen = 0
-    saved = np.empty((n_rows, 5))
     for k in range(n_rows):
         row = rows[k]
-        b = body_b[k]
-        impact_impulses[k, 0] = impact_impulses[k, 1] = impact_impulses[k, 2] = 0.0
-        if marks[body_a[k]] == 0 and marks[b] == 0:
+        for d in range(3):
+            impact_impulses[k, d] = 0.0
+        if marks[body_a[k]] == 0 and marks[body_b[k]] == 0:
             continue
-        if b > n_rocks:
-            dx, dy, dz = _relative_velocity_machine(row, bodies[body_a[k]], machine, velocity, b - n_rocks - 1)
-        else:
-            dx, dy, dz = _relative_velocity(row, bodies[body_a[k]], bodies[b])
-        approach = row[NORMAL] * dx + row[NORMAL + 1] * dy + row[NORMAL + 2] * dz
-        if row[GAP] > 0.0 and row[GAP] + time_step * approach >= 0.0:
-            continue
-        # A contact without restitution that is still apart is left to the resting stage.
-        if row[GAP] > 0.0 and row[RESTITUTION] <= 0.0:
+        # Not reached within the step; or without restitution and still apart: left to the resting stage.
+        if row[GAP] > 0.0 and (row[GAP] + time_step * approach[k] >= 0.0 or row[RESTITUTION] <= 0.0):
             continue
         for d in range(3):
             saved[n_chosen, d] = row[IMPULSE + d]
             row[IMPULSE + d] = 0.0
         saved[n_chosen, 3], saved[n_chosen, 4] = row[BIAS], row[COMPLIANCE]
-        row[BIAS] = -row[RESTITUTION] * approach if approach < -threshold else 0.0
+        saved[n_chosen, 5] = row[NORMAL_MASS]
+        row[BIAS] = -row[RESTITUTION] * approach[k] if approach[k] < -threshold else 0.0
+        # rigid
+        if row[NORMAL_MASS] > 0.0:
+            row[NORMAL_MASS] = 1.0 / (1.0 / row[NORMAL_MASS] - row[COMPLIANCE])
         row[COMPLIANCE] = 0.0
         chosen[n_chosen] = k
         n_chosen += 1
+    n_free = 0
+    while n_free < n_chosen and body_b[chosen[n_free]] <= n_rocks:
+        n_free += 1
     for _ in range(iterations):
-        for c in range(n_chosen):
+        for c in range(n_free):
             k = chosen[c]
-            _solve_contact(rows[k], body_a[k], body_b[k], bodies, n_rocks, machine, velocity)
+            _solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]])
+        _solve_machine_contacts(
+            rows, chosen[n_free:n_chosen], body_a, body_b, bodies, n_rocks, machine, velocity
+        )
     for c in range(n_chosen):
         k = chosen[c]
         row = rows[k]
-        for d in range(3):
-            impact_impulses[k, d] = (
-                row[IMPULSE] * row[NORMAL + d]
-                + row[IMPULSE + 1] * row[TANGENT_1 + d]
-                + row[IMPULSE + 2] * row[TANGENT_2 + d]
-            )
+        impact_impulses[k, 0], impact_impulses[k, 1], impact_impulses[k, 2] = _calc_impulse(row)
         for d in range(3):
             row[IMPULSE + d] = saved[c, d]
-        row[BIAS], row[COMPLIANCE] = saved[c, 3], saved[c, 4]
+        row[BIAS], row[COMPLIANCE], row[NORMAL_MASS] = saved[c, 3], saved[c, 4], saved[c, 5]
     return n_impacts
