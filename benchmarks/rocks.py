@@ -165,6 +165,17 @@ def make_dig(depth: float) -> Rates:
     return rates
 
 
+def find_toe(pile: PileState) -> float:
+    """Return where the pile begins on the machine's way [m]; single rocks before it are left out."""
+    low = pile.p_WRs[(np.abs(pile.p_WRs[:, 1]) < 1.5) & (pile.p_WRs[:, 2] < 0.6)]
+    return float(np.percentile(low[:, 0], 5))
+
+
+def clear_way(pile: PileState) -> PileState:
+    """Return the pile without the single rocks where the machine starts."""
+    return pile.select(np.flatnonzero(pile.p_WRs[:, 0] > find_toe(pile) - 0.5))
+
+
 def build_dig(
     pile: PileState, rates: Rates, config: NonsmoothConfig, time_step: float = TIME_STEP, site: SiteConfig = SITE
 ) -> tuple[Simulator, object, Machine, NonsmoothRocks]:
@@ -185,8 +196,7 @@ def build_dig(
         builder.Connect(motors.GetOutputPort("desired_state"), port)
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
-    low = pile.p_WRs[(np.abs(pile.p_WRs[:, 1]) < 1.5) & (pile.p_WRs[:, 2] < 0.6)]
-    toe = float(np.percentile(low[:, 0], 3))
+    toe = find_toe(pile)
     set_machine_pose(plant, plant.GetMyMutableContextFromRoot(context), machine, x_tip=toe - 1.0, z_tip=0.02)
     simulator.Initialize()
     return simulator, plant, machine, rocks
@@ -197,13 +207,13 @@ def run_dig(
     site: SiteConfig = SITE,
 ) -> dict[str, float]:  # fmt: skip
     """Run a dig; return what it cost and did."""
+    pile = clear_way(pile)
     simulator, plant, _machine, rocks = build_dig(pile, rates, config, time_step, site)
     root = simulator.get_mutable_context()
     context = rocks.GetMyContextFromRoot(root)
     plant_context = plant.GetMyContextFromRoot(root)
     bucket = plant.GetBodyByName("bucket")
-    for _ in range(2):  # loads the compiled kernels
-        rocks.engine.advance(rocks.engine.make_arrays(pile))
+    rocks.get_report(root)  # loads the compiled kernels
     n_steps = round(duration / time_step)
     forces, summaries, fastest, redone = np.zeros((n_steps, 6)), np.zeros((n_steps, 6)), 0.0, 0
     cpu = time.process_time()
