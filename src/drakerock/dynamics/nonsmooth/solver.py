@@ -73,8 +73,8 @@ class MachineArrays(NamedTuple):
         rows: (m, v) what each row measures.
         row_response: (m, v) change of the generalised velocities by a unit of each row's impulse.
         row_values: (m, MACHINE_ROW_WIDTH): velocity aimed at, compliance, least and greatest impulse,
-            1 / (diagonal + compliance), impulse, and for friction rows the row of the normal impulse that
-            multiplies the limits (else -1).
+            1 / (diagonal + compliance), impulse, and for friction rows, which come in pairs, the row of the normal
+            impulse that multiplies the limits (else -1).
     """
 
     jacobian: NDArray[np.float64]
@@ -436,27 +436,49 @@ def _find_machine_rows(n_rows, body_b, n_rocks):
 
 
 @kernel
+def _calc_row_impulse(machine, velocity, k):
+    """Return what the impulse of the machine's row k has to be, limits left aside."""
+    values = machine.row_values
+    measured = 0.0
+    for d in range(len(velocity)):
+        measured += machine.rows[k, d] * velocity[d]
+    old = values[k, ROW_IMPULSE]
+    return old + (values[k, TARGET] - measured - values[k, ROW_COMPLIANCE] * old) * values[k, ROW_MASS]
+
+
+@kernel
+def _set_row_impulse(machine, velocity, k, impulse):
+    """Set the impulse of the machine's row k, and the velocities accordingly."""
+    change = impulse - machine.row_values[k, ROW_IMPULSE]
+    if change != 0.0:
+        machine.row_values[k, ROW_IMPULSE] = impulse
+        for d in range(len(velocity)):
+            velocity[d] += machine.row_response[k, d] * change
+
+
+@kernel
 def _solve_machine_rows(machine, velocity):
-    """Sweep over the machine's own rows: motors, stops, tyres."""
+    """Sweep over the machine's own rows: motors, stops, tyres. A normal row is followed by its two of friction."""
     values = machine.row_values
     for _ in range(MACHINE_SWEEPS):
-        for k in range(len(values)):
-            lower, upper = values[k, LOWER], values[k, UPPER]
+        k = 0
+        while k < len(values):
             normal = int(values[k, NORMAL_ROW])
-            if normal >= 0:
-                lower *= values[normal, ROW_IMPULSE]
-                upper *= values[normal, ROW_IMPULSE]
-            measured = 0.0
-            for d in range(len(velocity)):
-                measured += machine.rows[k, d] * velocity[d]
-            old = values[k, ROW_IMPULSE]
-            new = old + (values[k, TARGET] - measured - values[k, ROW_COMPLIANCE] * old) * values[k, ROW_MASS]
-            new = min(max(new, lower), upper)
-            change = new - old
-            if change != 0.0:
-                values[k, ROW_IMPULSE] = new
-                for d in range(len(velocity)):
-                    velocity[d] += machine.row_response[k, d] * change
+            if normal < 0:
+                impulse = _calc_row_impulse(machine, velocity, k)
+                _set_row_impulse(machine, velocity, k, min(max(impulse, values[k, LOWER]), values[k, UPPER]))
+                k += 1
+            else:
+                one = _calc_row_impulse(machine, velocity, k)
+                two = _calc_row_impulse(machine, velocity, k + 1)
+                limit = values[k, UPPER] * values[normal, ROW_IMPULSE]
+                size = math.sqrt(one * one + two * two)
+                if size > limit:
+                    one *= limit / size
+                    two *= limit / size
+                _set_row_impulse(machine, velocity, k, one)
+                _set_row_impulse(machine, velocity, k + 1, two)
+                k += 2
 
 
 @kernel
