@@ -4,8 +4,8 @@
     python benchmarks/faithfulness.py table --out build/faithfulness
 
 Each seed is a pile (or, at full size, a place and depth of the dig in one pile), dug once per variant. The table
-gives the mean paired difference against `none` (all awake) relative to its mean, with its 90 % confidence interval. Runs
-that are stored already are skipped, so a study can be stopped and continued.
+gives the mean paired difference against `none` (all awake) relative to its mean, with its 90 % confidence
+interval. Runs that are stored already are skipped, so a study can be stopped and continued.
 """
 
 from __future__ import annotations

@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from machine_rocks_helpers import Scene
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialVelocity
-from rock_helpers import draw_quaternion, make_engine, make_pile, run
 
 from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
 from drakerock.pile.config import RocksConfig, SiteConfig
 from drakerock.pile.shapes import load_rock_shapes
 from drakerock.pile.site import make_site
+from machine_rocks_helpers import Scene
+from rock_helpers import draw_quaternion, make_engine, make_pile, run
 
 G = 9.81
 AWAKE = DynamicsConfig(nonsmooth=NonsmoothConfig(reduction="none"))
@@ -57,7 +57,12 @@ def test_bucket_lifts_a_heap_and_the_boom_motor_feels_its_weight():
     assert np.std(forces, axis=0)[5] < 0.01 * mass.sum() * G
     # The boom motor: the load's weight at its distance from the hinge, against the machine without a load.
     empty = Scene(
-        make_pile([[3.0, 0, 0.3]], size=[0.4]), lambda t: (0, 0, 0), dynamics=AWAKE, x_tip=-8.0, z_tip=1.6, psi=0.5
+        make_pile([[3.0, 0, 0.3]], size=[0.4]),
+        lambda t: (0, 0, 0),
+        dynamics=AWAKE,
+        x_tip=-8.0,
+        z_tip=1.6,
+        psi=0.5,
     )
     for _ in range(150):
         empty.step()
@@ -93,7 +98,10 @@ def test_momentum_of_machine_and_rocks_together():
     gravity = np.array([0.0, 0.0, -G * 0.01])
     exchanged = 0.0
     for _ in range(20):
-        rocks, machine = masses @ scene.rocks.get_pile(scene.context).V_WRs[:, 3:], scene.get_machine_momentum()
+        rocks, machine = (
+            masses @ scene.rocks.get_pile(scene.context).V_WRs[:, 3:],
+            scene.get_machine_momentum(),
+        )
         report = scene.rocks.get_report(scene.context)
         impulse = 0.01 * report.F_Bs_W[:, 3:].sum(axis=0)
         scene.step()
@@ -102,7 +110,9 @@ def test_momentum_of_machine_and_rocks_together():
         np.testing.assert_allclose(change, masses.sum() * gravity - impulse, atol=1e-9 * machine_mass)
         # the plant's own discretisation moves its momentum a little as its joints turn
         change = scene.get_machine_momentum() - machine
-        np.testing.assert_allclose(change, machine_mass * gravity + impulse, atol=0.5 + 1e-2 * np.abs(impulse).max())
+        np.testing.assert_allclose(
+            change, machine_mass * gravity + impulse, atol=0.5 + 1e-2 * np.abs(impulse).max()
+        )
         exchanged = max(exchanged, np.abs(impulse).max())
     assert exchanged > 100.0
 
@@ -115,7 +125,11 @@ def jammed():
     k = np.arange(n)
     pile = make_pile(
         np.column_stack(
-            [0.5 + (k % 4) * 0.9 + rng.uniform(-0.05, 0.05, n), -2.7 + ((k // 4) % 6) * 1.05, 0.6 + (k // 24) * 0.95]
+            [
+                0.5 + (k % 4) * 0.9 + rng.uniform(-0.05, 0.05, n),
+                -2.7 + ((k // 4) % 6) * 1.05,
+                0.6 + (k // 24) * 0.95,
+            ]
         ),
         shape=rng.integers(0, 6, n),
         size=rng.choice([0.6, 0.8], n),
@@ -186,10 +200,8 @@ def test_the_solve_foresees_the_plants_motion(jammed):
 
 def test_a_restored_context_repeats_bit_for_bit(jammed):
     pile, site = jammed
-    options = dict(
-        site=site, dynamics=DynamicsConfig(), x_tip=float(pile.p_WRs[:, 0].min()) - 0.7, z_tip=0.02
-    )  # fmt: skip
-    scene = Scene(pile, lambda t: (1.0, 0, 0), **options)
+    x_tip = float(pile.p_WRs[:, 0].min()) - 0.7
+    scene = Scene(pile, lambda t: (1.0, 0, 0), site=site, x_tip=x_tip, z_tip=0.02)
     for _ in range(150):
         scene.step()
     saved = scene.context.Clone()
