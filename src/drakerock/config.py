@@ -11,14 +11,13 @@ import hashlib
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from drakerock.errors import InputError
 
-ConfigT = TypeVar("ConfigT", bound="Config")
 Key = tuple[str | int, ...]
 
 
@@ -39,7 +38,9 @@ def calc_config_hash(config: BaseModel, *extra: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def load_config(path: str | Path, schema: type[ConfigT], overrides: Sequence[str] = ()) -> ConfigT:
+def load_config[ConfigT: Config](
+    path: str | Path, schema: type[ConfigT], overrides: Sequence[str] = ()
+) -> ConfigT:
     """Read a YAML file into `schema`.
 
     Args:
@@ -59,7 +60,7 @@ def load_config(path: str | Path, schema: type[ConfigT], overrides: Sequence[str
     return parse_config(text, schema, overrides, source=str(path))
 
 
-def parse_config(
+def parse_config[ConfigT: Config](
     text: str, schema: type[ConfigT], overrides: Sequence[str] = (), source: str = "<text>"
 ) -> ConfigT:
     """Parse YAML text into `schema`; `source` is the name used in messages. Raises as `load_config`."""
@@ -73,7 +74,9 @@ def parse_config(
         raise InputError(f"{where}: not valid YAML: {problem}") from None
     data = {} if data is None else data
     if not isinstance(data, dict):
-        raise InputError(f"{source}: expected keys and values at the top level, found a {type(data).__name__}")
+        raise InputError(
+            f"{source}: expected keys and values at the top level, found a {type(data).__name__}"
+        )
     overridden = _apply_overrides(data, overrides)
     try:
         return schema.model_validate(data)
@@ -88,7 +91,9 @@ def _apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[Key
         name, sep, value = item.partition("=")
         path = tuple(name.strip().split("."))
         if not sep or not all(path):
-            raise InputError(f"--set {item}: expected key=value, for example --set loading.strategy.alpha=1.2")
+            raise InputError(
+                f"--set {item}: expected key=value, for example --set loading.strategy.alpha=1.2"
+            )
         try:
             parsed = yaml.safe_load(value)
         except yaml.YAMLError:

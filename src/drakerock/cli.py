@@ -1,0 +1,201 @@
+"""The `drakerock` command: parses arguments, calls one function each."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from drakerock.errors import InputError, SimulationFailure
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Simulation-based development of robotic rock loading, built on Drake.",
+)
+console = Console(stderr=True)
+output = Console()
+
+ScenarioArgument = Annotated[
+    Path | None, typer.Argument(help="Scenario YAML file; left out: the shipped studies/demo.yaml.")
+]
+OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results; made if missing.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a scenario key (dotted).")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print only JSON on standard output.")]
+SeedOption = Annotated[int | None, typer.Option(help="Seed of all randomness.")]
+
+
+def main() -> None:
+    """Run the command line; bad input prints one message and exits with 2, a failed simulation with 1."""
+    try:
+        app()
+    except InputError as error:
+        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        sys.exit(2)
+    except SimulationFailure as error:
+        console.print(f"[bold red]failed:[/] {error}", highlight=False, soft_wrap=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        console.print("interrupted")
+        sys.exit(130)
+
+
+@app.command()
+def pile(
+    scenario: ScenarioArgument = None,
+    out: OutOption = Path("out/pile"),
+    seed: SeedOption = None,
+    set_: SetOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """Make (or take from the cache) the rock pile of a scenario.
+
+    Example: drakerock pile studies/demo.yaml --out out/pile
+    """
+    from drakerock.study.jobs import make_pile_files
+
+    with _show_progress("pile") as advance:
+        summary, paths = make_pile_files(_load(scenario, seed, set_), out, advance)
+    if json_:
+        print(json.dumps(summary))
+        return
+    _print_table("Pile", summary)
+    _print_paths(paths)
+
+
+@app.command()
+def load(
+    scenario: ScenarioArgument = None,
+    out: OutOption = Path("out/load"),
+    alpha: Annotated[float | None, typer.Option(help="Fill ratio aimed at, 0.2 to 2.")] = None,
+    beta: Annotated[float | None, typer.Option(help="Dig height, 0 deep to 1 shallow.")] = None,
+    gamma: Annotated[float | None, typer.Option(help="Entry point, 1 front-most, 0 rear-most.")] = None,
+    kappa: Annotated[float | None, typer.Option(help="Share of the curl done while lifting, 0 to 1.")] = None,
+    seed: SeedOption = None,
+    set_: SetOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """Run one loading cycle and write its outcome, signals, piles and replay.
+
+    Example: drakerock load studies/demo.yaml --alpha 1.3 --beta 0.85 --out out/load
+    """
+    from drakerock.study.jobs import run_and_save
+
+    strategy = {"alpha": alpha, "beta": beta, "gamma": gamma, "kappa": kappa}
+    overrides = [f"loading.strategy.{key}={value}" for key, value in strategy.items() if value is not None]
+    with _show_progress("load") as advance:
+        result, paths = run_and_save(_load(scenario, seed, [*(set_ or []), *overrides]), out, advance)
+    if json_:
+        print(result.to_json(), end="")
+    else:
+        _print_outcome(result)
+        _print_paths(paths)
+    if result.status == "failed":
+        raise SimulationFailure(result.reason)
+
+
+@app.command()
+def replay(
+    folder: Annotated[Path, typer.Argument(help="Folder of a finished cycle.")],
+) -> None:
+    """Make replay.html anew from a stored recording.
+
+    Example: drakerock replay out/load
+    """
+    from drakerock.loading.recording import load_recording
+    from drakerock.viewing.replay import write_replay
+
+    path = folder / "replay.html"
+    write_replay(load_recording(folder / "recording.npz"), path)
+    _print_paths([path])
+
+
+def _load(path: Path | None, seed: int | None, overrides: list[str] | None) -> Any:
+    from drakerock.loading.scenario import load_scenario
+
+    extra = [f"seed={seed}"] if seed is not None else []
+    return load_scenario(path, [*(overrides or []), *extra])
+
+
+@contextmanager
+def _show_progress(name: str) -> Iterator[Callable[[str, float | None], None]]:
+    """Show what is being done on standard error; plain (and silent) when that is not a terminal."""
+    columns = (TextColumn("[bold]{task.fields[stage]:<18}"), BarColumn(), TextColumn("{task.fields[note]}"))
+    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
+        task = progress.add_task(name, total=None, stage=name, note="")
+
+        def advance(stage: str, share: float | None = None, note: str = "") -> None:
+            progress.update(
+                task, stage=stage, total=None if share is None else 1.0, completed=share or 0, note=note
+            )
+
+        yield advance
+
+
+def _print_outcome(outcome: Any) -> None:
+    table = Table(title="Loading cycle", show_header=False, title_justify="left")
+    table.add_column(style="bold")
+    table.add_column()
+    s = outcome.strategy
+
+    def show(value: float | None, form: str) -> str:
+        return "-" if value is None else form.format(value)
+
+    table.add_row("strategy", "  ".join(f"{key} {value:g}" for key, value in s.items()))
+    table.add_row("ended", f"{outcome.status}: {outcome.reason}")
+    table.add_row("production", show(outcome.objectives["production"], "{:.0f} kg/s"))
+    table.add_row("damage", show(outcome.objectives["damage"], "{:.4f}"))
+    table.add_row("debris", show(outcome.objectives["debris"], "{:.0f} kg"))
+    mass = show(outcome.bucket_mass_kg, "{:.0f} kg")
+    table.add_row("bucket load", f"{mass} in {show(outcome.bucket_rocks, '{:d}')} rocks")
+    table.add_row("weighed", show(outcome.weighed_mass_kg, "{:.0f} kg"))
+    table.add_row("loading time t4 - t0", show(outcome.loading_time_s, "{:.2f} s"))
+    table.add_row("t0 ... t4", "  ".join(show(t, "{:.2f}") for t in outcome.waypoint_times_s) + " s")
+    if "volume_m3" in outcome.plan:
+        plan = outcome.plan
+        note = "" if plan["volume_reached"] else " (the nearest that can be reached)"
+        table.add_row("planned volume", f"{plan['volume_m3']:.2f} of {plan['volume_wanted_m3']:.2f} m3{note}")
+    table.add_row("push force mean, peak", f"{show(_kilo(outcome.mean_push_force_N), '{:.0f}')}, "
+                  f"{show(_kilo(outcome.peak_push_force_N), '{:.0f}')} kN")  # fmt: skip
+    table.add_row("motors' work", show(_kilo(outcome.energy_J), "{:.0f} kJ"))
+    events = ", ".join(f"{item['event']} at {item['time_s']:.2f} s" for item in outcome.events) or "none"
+    table.add_row("events", events)
+    rocks = outcome.rocks
+    table.add_row(
+        "rocks", f"{rocks['total']:.0f}, awake {rocks['awake_mean']:.0f} mean, {rocks['awake_max']:.0f} max"
+    )
+    table.add_row(
+        "cost",
+        f"{outcome.wall_time_s:.1f} s for {outcome.sim_time_s:.1f} s, {outcome.ms_per_step:.1f} ms per step",
+    )
+    output.print(table)
+
+
+def _kilo(value: float | None) -> float | None:
+    return None if value is None else value / 1e3
+
+
+def _print_table(title: str, rows: dict[str, Any]) -> None:
+    table = Table(title=title, show_header=False, title_justify="left")
+    table.add_column(style="bold")
+    table.add_column()
+    for key, value in rows.items():
+        shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+        table.add_row(key.replace("_", " "), shown)
+    output.print(table)
+
+
+def _print_paths(paths: list[Path]) -> None:
+    for path in paths:
+        output.print(f"wrote {path}", highlight=False, soft_wrap=True)

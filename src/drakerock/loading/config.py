@@ -1,0 +1,87 @@
+"""The loading operation's part of the configuration (method section 5)."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from drakerock.config import Config
+
+Positive = Annotated[float, Field(gt=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class StrategyConfig(Config):
+    """The four design variables (method section 5)."""
+
+    alpha: Annotated[float, Field(ge=0.2, le=2, description="bucket fill ratio aimed at, V_d / V_b")] = 1.1
+    beta: Annotated[Share, Field(description="dig height h_s2 / h_p: 0 deep, 1 shallow")] = 0.5
+    gamma: Annotated[Share, Field(description="entry point: 1 front-most slice, 0 rear-most")] = 0.5
+    kappa: Annotated[Share, Field(description="share of the curl done between s1 and s2")] = 0.5
+
+
+class SensingConfig(Config):
+    """The height field and what is read from it."""
+
+    cell: Annotated[float, Field(gt=0.02, le=2, description="grid spacing [m]")] = 0.26
+    front_height: Annotated[float, Field(gt=0, le=2, description="the front is where h exceeds this [m]")] = (
+        0.15
+    )
+
+
+class PlanningConfig(Config):
+    """The dig plan's limits and speeds."""
+
+    v_x_max: Annotated[float, Field(gt=0, le=5, description="forward and reverse speed [m/s]")] = 1.3
+    r_ft: Annotated[float, Field(gt=0, le=20, description="reach that scales the dig height, h_p [m]")] = 4.24
+    tilt_rate: Annotated[float, Field(gt=0, le=3, description="bucket's rate on [s2, s3] [rad/s]")] = 0.5
+    ramp: Annotated[
+        float, Field(gt=0, le=0.5, description="share of a segment for each smooth ramp of the speeds")
+    ] = 0.15
+    wall_clearance: Annotated[float, Field(ge=0, le=2, description="machine to drift wall [m]")] = 0.15
+    stop_margin: Annotated[
+        float, Field(ge=0, le=0.3, description="full tilt is planned this far inside the joint stop [rad]")
+    ] = 0.02
+    floor_clearance: Annotated[
+        float, Field(ge=0, le=0.5, description="tip above the floor while it is lowered [m]")
+    ] = 0.03
+    run_up: Annotated[float, Field(gt=0, le=30, description="tip to s0 when the loading starts [m]")] = 1.5
+    n_segment: Annotated[int, Field(ge=10, le=2000, description="path points a segment")] = 60
+
+
+class ControlConfig(Config):
+    """The feed-forward controller."""
+
+    speed_floor: Annotated[
+        float, Field(gt=0, le=1, description="lowest speed before a waypoint, share of its segment's maximum")
+    ] = 0.1
+    timeout: Annotated[float, Field(gt=0, description="allowed beyond a segment's planned time [s]")] = 5.0
+
+
+class PerformanceConfig(Config):
+    """Objectives and events."""
+
+    tau_c: Annotated[float, Field(gt=0, description="critical hinge moment [N m]")] = 145e3
+    t_char: Annotated[float, Field(gt=0, description="characteristic time of the damage integral [s]")] = 12.0
+    settle_time: Annotated[
+        float, Field(ge=0, le=60, description="at most this long after s4 for the rocks to rest [s]")
+    ] = 4.0
+    rest_speed: Annotated[float, Field(gt=0, description="rocks slower than this rest [m/s]")] = 0.1
+    stall_speed: Annotated[
+        float, Field(gt=0, description="stall: slower than this while told to drive on [m/s]")
+    ] = 0.05
+    slip_ratio: Annotated[
+        float, Field(gt=0, description="slip event: |v_wheel - v| / v_x_max above this")
+    ] = 0.5
+    event_time: Annotated[float, Field(ge=0, description="shortest stall or slip that counts [s]")] = 0.2
+
+
+class LoadingConfig(Config):
+    """Everything about one loading cycle but machine, site and rocks."""
+
+    strategy: StrategyConfig = StrategyConfig()
+    sensing: SensingConfig = SensingConfig()
+    planning: PlanningConfig = PlanningConfig()
+    control: ControlConfig = ControlConfig()
+    performance: PerformanceConfig = PerformanceConfig()

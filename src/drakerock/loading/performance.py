@@ -1,0 +1,97 @@
+"""Performance of a cycle: production, structural damage, debris, and the events of the record (section 5)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from drakerock.dynamics.contact_graph import find_loose
+from drakerock.loading.config import PerformanceConfig
+from drakerock.machine.geometry import BucketGeometry
+from drakerock.pile.shapes import RockShape
+from drakerock.pile.state import PileState
+
+Array = NDArray[np.float64]
+
+
+def find_bucket_load(pile: PileState, bucket: BucketGeometry, X_WB: RigidTransform) -> NDArray[np.bool_]:
+    """Return which rocks are in the bucket (n,): centre of mass in the load region, between the side plates."""
+    p_BRs = X_WB.inverse().multiply(np.asfortranarray(pile.p_WRs.T)).T if len(pile) else pile.p_WRs
+    region = shapely.Polygon(bucket.load_region)
+    inside = shapely.contains_xy(region, p_BRs[:, 0], p_BRs[:, 2])
+    return inside & (np.abs(p_BRs[:, 1]) <= 0.5 * bucket.inner_width) & ~pile.fixed
+
+
+def calc_damage(time: Array, moment: Array, start: float, end: float, config: PerformanceConfig) -> float:
+    """Return phi2 = 1/t_char * integral over [start, end] of max(|tau| - tau_c, 0) / tau_c dt (section 5).
+
+    Args:
+        time: (k,) step times, evenly spaced [s].
+        moment: (k,) bending and twisting moment of the bucket hinge over the step that begins then [N m].
+        start, end: t0 and t4 [s].
+        config: tau_c, t_char.
+    """
+    excess = np.maximum(np.abs(moment) - config.tau_c, 0.0) / config.tau_c
+    step = float(np.median(np.diff(time)))
+    inside = (time >= start - 1e-9) & (time < end - 1e-9)
+    return float(np.sum(excess[inside]) * step / config.t_char)
+
+
+def find_debris(
+    pile: PileState, shapes: tuple[RockShape, ...], in_bucket: NDArray[np.bool_], gap: float
+) -> NDArray[np.bool_]:
+    """Return which rocks (n,) are debris: neither in the bucket nor connected to the pile by contacts.
+
+    Args:
+        pile: all rocks at rest, fixed ones included.
+        shapes: the rock shapes.
+        in_bucket: (n,) rocks that the bucket holds.
+        gap: rocks nearer than this touch [m].
+    """
+    debris = np.zeros(len(pile), bool)
+    debris[~in_bucket] = find_loose(pile.select(~in_bucket), shapes, gap)
+    return debris
+
+
+def find_events(
+    signals: dict[str, Array],
+    timeouts: Array,
+    waypoint_times: Array,
+    config: PerformanceConfig,
+    v_x_max: float,
+) -> list[dict[str, Any]]:
+    """Return stalls, slips and time-outs in the order of their times; none of them ends a cycle.
+
+    Args:
+        signals: columns of the cycle.
+        timeouts: (5,) 1 for each segment that ended by its time-out, the approach first.
+        waypoint_times: (5,) t0 to t4 [s].
+        config: thresholds.
+        v_x_max: scale of the slip threshold [m/s].
+
+    Returns:
+        One dict each: ``event`` (stall, slip, timeout), ``time_s``, and ``duration_s`` or ``waypoint``.
+    """
+    time = signals["time"]
+    told = np.abs(signals["target_wheel_rate"]) > 1e-9
+    driving = told & (signals["mode"] >= 1)
+    found: list[dict[str, Any]] = []
+    for name, mask in (
+        ("stall", driving & (np.abs(signals["v_F"]) < config.stall_speed)),
+        ("slip", told & (np.abs(signals["wheel_slip"]) > config.slip_ratio * v_x_max)),
+    ):
+        edges = np.diff(np.concatenate([[False], mask, [False]]).astype(int))
+        step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+        for first, last in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+            duration = (last - first) * step
+            # Shorter than this it is the start or the turn of the drive, not an event.
+            if duration >= config.event_time:
+                found.append({"event": name, "time_s": float(time[first]), "duration_s": float(duration)})
+    for k, late in enumerate(timeouts):
+        if late:
+            found.append({"event": "timeout", "time_s": float(waypoint_times[k]), "waypoint": f"s{k}"})
+    return sorted(found, key=lambda item: item["time_s"])

@@ -1,0 +1,413 @@
+"""Dig planning: from the observed pile and a strategy to a bucket path (method section 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import Context, LeafSystem, State
+from scipy.optimize import brentq
+
+from drakerock.loading.config import PlanningConfig, SensingConfig, StrategyConfig
+from drakerock.loading.field import HeightField, PileProfile, calc_pile_profile
+from drakerock.loading.plan import DigPlan, NoPlan, SpeedTable
+from drakerock.machine.geometry import BucketGeometry, calc_heaped_capacity
+from drakerock.machine.kinematics import (
+    Kinematics,
+    calc_bucket_range,
+    calc_full_tilt,
+    calc_joint_angles,
+    calc_joint_rates,
+    calc_pitch,
+    calc_tip,
+)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DiggingMachine:
+    """What a plan needs to know of the machine.
+
+    Attributes:
+        kinematics: lengths, angles, limits.
+        bucket: the bucket's geometry.
+        width: the machine's largest width [m].
+    """
+
+    kinematics: Kinematics
+    bucket: BucketGeometry
+    width: float
+
+    def calc_outline(self) -> Array:
+        """Return the bucket's side profile (k, 2) relative to its tip, at pitch 0 [m]."""
+        return self.bucket.profile - self.bucket.profile[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Path:
+    """Tip path relative to the tip at its start, with the joint angles along it."""
+
+    x: Array
+    z: Array
+    psi: Array
+    phi_l: Array
+    phi_b: Array
+    t: Array
+
+
+def choose_entry_slice(profile: PileProfile, gamma: float, half_room: float) -> int | None:
+    """Return the index of the slice to enter at, or None if no candidate holds any pile.
+
+    The candidates, slices at which the machine fits, are ordered by their centre of mass x_m; gamma = 1 takes
+    the front-most (nearest to the machine), gamma = 0 the rear-most.
+
+    Args:
+        profile: the pile's curves.
+        gamma: in [0, 1].
+        half_room: largest |y| at which the machine fits between the walls [m].
+    """
+    fits = (np.abs(profile.y) <= half_room + 1e-9) & np.isfinite(profile.x_mass)
+    candidates = np.flatnonzero(fits)
+    if len(candidates) == 0:
+        return None
+    ordered = candidates[np.argsort(profile.x_mass[candidates], kind="stable")]
+    return int(ordered[round((1.0 - gamma) * (len(ordered) - 1))])
+
+
+def calc_ramp(u: Array, ramp: float, floor: float, *, up: bool, down: bool) -> Array:
+    """Return speed shares over a segment's progress u in [0, 1]: 1 with smooth ramps to `floor` at the ends."""
+
+    def calc_smooth(v: Array) -> Array:
+        v = np.clip(v, 0.0, 1.0)
+        return v * v * (3.0 - 2.0 * v)
+
+    share = np.ones_like(u)
+    if up:
+        share = np.minimum(share, floor + (1.0 - floor) * calc_smooth(u / ramp))
+    if down:
+        share = np.minimum(share, floor + (1.0 - floor) * calc_smooth((1.0 - u) / ramp))
+    return share
+
+
+def calc_swept_volume(swept: shapely.Geometry, field: HeightField, y: float, width: float) -> float:
+    """Return the volume of pile inside a swept section, over the bucket's width [m^3].
+
+    Each grid column counts with the share of its cell under the width, each bit of pile once.
+
+    Args:
+        swept: polygon(s) in the plane of x and z [m].
+        field: the undisturbed pile.
+        y: the bucket's middle [m].
+        width: the bucket's width [m].
+    """
+    half = 0.5 * field.cell
+    overlap = np.minimum(field.y + half, y + 0.5 * width) - np.maximum(field.y - half, y - 0.5 * width)
+    volume = 0.0
+    left, right = field.x - half, field.x + half
+    for j in np.flatnonzero(overlap > 0):
+        full = field.h[:, j] > 0
+        columns = shapely.box(left[full], 0.0, right[full], field.h[full, j])
+        volume += overlap[j] * float(np.sum(shapely.area(shapely.intersection(columns, swept))))
+    return volume
+
+
+def sweep_profile(profile: Array, x: Array, z: Array, psi: Array) -> shapely.Geometry:
+    """Return the union of a bucket's side profile over a path of its tip.
+
+    Args:
+        profile: (k, 2) outline relative to the tip, x forward and z up at pitch 0 [m].
+        x, z, psi: (n,) tip positions [m] and pitches [rad] (nose-up).
+    """
+    parts = shapely.get_parts(shapely.constrained_delaunay_triangles(shapely.Polygon(profile)))
+    corners = np.array([np.asarray(part.exterior.coords)[:3] for part in parts])
+    c, s = np.cos(psi), np.sin(psi)
+    turned = np.stack(
+        [
+            corners[None, ..., 0] * c[:, None, None] - corners[None, ..., 1] * s[:, None, None],
+            corners[None, ..., 0] * s[:, None, None] + corners[None, ..., 1] * c[:, None, None],
+        ],
+        axis=-1,
+    )
+    turned += np.stack([x, z], axis=-1)[:, None, None, :]
+    if len(x) == 1:
+        return shapely.union_all(shapely.polygons(turned[0]))
+    # Between two poses each convex part sweeps, to second order in the turn, the hull of both.
+    pairs = np.concatenate([turned[:-1], turned[1:]], axis=2)
+    hulls = shapely.convex_hull(shapely.multipoints(pairs.reshape(-1, 6, 2)))
+    return shapely.union_all(hulls)
+
+
+def make_dig_plan(
+    field: HeightField,
+    strategy: StrategyConfig,
+    machine: DiggingMachine,
+    config: PlanningConfig,
+    sensing: SensingConfig,
+    drift_width: float,
+    speed_floor: float,
+) -> DigPlan | NoPlan:
+    """Plan one loading.
+
+    Args:
+        field: the sensed pile.
+        strategy: alpha, beta, gamma, kappa.
+        machine: the machine's geometry.
+        config: speeds and limits.
+        sensing: where the front is.
+        drift_width: between the walls [m].
+        speed_floor: lowest share of a segment's speed, as the controller keeps it.
+    """
+    profile = calc_pile_profile(field, sensing.front_height)
+    kin, width = machine.kinematics, machine.bucket.outer_width
+    half_room = 0.5 * (drift_width - machine.width) - config.wall_clearance
+    if half_room < 0:
+        return NoPlan(f"the machine ({machine.width:.2f} m wide) does not fit the drift ({drift_width:g} m)")
+    entry = choose_entry_slice(profile, strategy.gamma, half_room)
+    if entry is None:
+        return NoPlan("no candidate slice holds any pile")
+    y = float(profile.y[entry])
+    near = np.isfinite(profile.slope) & (np.abs(profile.y - y) <= 0.5 * width)
+    slope = float(np.mean(profile.slope[near]))
+    x_s0 = float(np.min(profile.x_front[near])) - 0.5 * field.cell
+    h_s2 = float(strategy.beta * config.r_ft * np.sin(slope))
+
+    # The tip enters at the clearance above the floor, so that much less is left to lift.
+    lift_height = max(h_s2 - config.floor_clearance, 0.0)
+
+    def plan_dig(height: float) -> tuple[_Path, float, _Tables]:
+        return _plan_dig(strategy.kappa, height, slope, kin, config, speed_floor)
+
+    def calc_overshoot(height: float) -> float:
+        return x_s0 + float(np.max(plan_dig(height)[0].x)) - field.x_end
+
+    if lift_height > 0.0 and calc_overshoot(lift_height) > 0.0:
+        # Too little room before the drift's rear end for the whole lift: it ends lower.
+        lift_height = float(brentq(calc_overshoot, 0.0, lift_height)) if calc_overshoot(0.0) < 0.0 else 0.0
+        h_s2 = lift_height + config.floor_clearance
+    dig, psi_m, tables = plan_dig(lift_height)
+    outline = machine.calc_outline()
+    swept_dig = sweep_profile(outline, dig.x, dig.z, dig.psi)
+
+    def calc_swept(depth: float) -> shapely.Geometry:
+        push = sweep_profile(outline, np.array([0.0, depth]), np.zeros(2), np.zeros(2))
+        moved = shapely.affinity.translate(swept_dig, depth, 0.0)
+        return shapely.affinity.translate(shapely.union(push, moved), x_s0, config.floor_clearance)
+
+    wanted = strategy.alpha * calc_heaped_capacity(machine.bucket)
+    depth_max = max(0.0, field.x_end - x_s0 - float(np.max(dig.x)))
+
+    def calc_excess(depth: float) -> float:
+        return calc_swept_volume(calc_swept(depth), field, y, width) - wanted
+
+    low, high = calc_excess(0.0), calc_excess(depth_max)
+    reached = bool(low <= 0.0 <= high)
+    if reached and depth_max > 0:
+        depth = float(brentq(calc_excess, 0.0, depth_max, xtol=1e-4))
+    else:
+        depth = 0.0 if low > 0.0 else depth_max
+        reached = bool(abs(calc_excess(depth)) <= 0.01 * wanted)
+    swept = calc_swept(depth)
+    volume = calc_swept_volume(swept, field, y, width)
+    return _assemble(
+        x_s0, depth, dig, tables, kin, config,
+        y=y, slope=slope, h_s2=h_s2, psi_m=psi_m, volume=volume, volume_wanted=wanted, reached=reached,
+        swept=swept,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Tables:
+    v_x: SpeedTable
+    v_z: SpeedTable
+    omega: SpeedTable
+    n_lift: int  # path points on [s1, s2]
+
+
+def _plan_dig(
+    kappa: float, h_s2: float, slope: float, kin: Kinematics, config: PlanningConfig, floor: float
+) -> tuple[_Path, float, _Tables]:
+    """Integrate the joints from s1 to s3, the tip starting at x = z = 0; full tilt found by iteration."""
+    phi_l, phi_b = (float(angle) for angle in calc_joint_angles(kin, config.floor_clearance, 0.0))
+    psi_m = float(calc_full_tilt(kin, phi_l)) - config.stop_margin
+    if h_s2 <= 0.0:
+        lift = _Path(*(np.array([value]) for value in (0.0, 0.0, 0.0, phi_l, phi_b, 0.0)))
+        tables = _make_tables(0.0, 0.0, 0.0, slope, kin, config, floor, n_lift=1)
+    else:
+        for _ in range(20):
+            tables = _make_tables(h_s2, kappa * psi_m, h_s2 / np.tan(slope), slope, kin, config, floor, 0)
+            lift = _integrate_lift(tables, phi_l, phi_b, kin, config)
+            tables = _make_tables(
+                h_s2, kappa * psi_m, h_s2 / np.tan(slope), slope, kin, config, floor, len(lift.x)
+            )
+            updated = float(calc_full_tilt(kin, float(lift.phi_l[-1]))) - config.stop_margin
+            if abs(updated - psi_m) < 1e-6:
+                break
+            psi_m = updated
+    # [s2, s3]: wheels and boom hold, the tip goes round the bucket hinge.
+    turn = np.linspace(0.0, max(psi_m - lift.psi[-1], 0.0), config.n_segment + 1)
+    psi = lift.psi[-1] + turn
+    phi_l_s2, phi_b_s2 = float(lift.phi_l[-1]), float(lift.phi_b[-1])
+    tip = calc_tip(kin, 0.0, phi_l_s2, phi_b_s2 - turn)
+    tip = tip - tip[0]
+    path = _Path(
+        np.concatenate([lift.x, lift.x[-1] + tip[1:, 0]]),
+        np.concatenate([lift.z, lift.z[-1] + tip[1:, 1]]),
+        np.concatenate([lift.psi, psi[1:]]),
+        np.concatenate([lift.phi_l, np.full(config.n_segment, phi_l_s2)]),
+        np.concatenate([lift.phi_b, (phi_b_s2 - turn)[1:]]),
+        np.concatenate([lift.t, lift.t[-1] + turn[1:] / config.tilt_rate]),
+    )
+    return path, float(psi_m), tables
+
+
+def _make_tables(
+    h_s2: float,
+    psi_s2: float,
+    length: float,
+    slope: float,
+    kin: Kinematics,
+    config: PlanningConfig,
+    floor: float,
+    n_lift: int,
+) -> _Tables:
+    """Make the speeds on [s1, s2], each over its own coordinate, all three taking the same time."""
+    u = np.linspace(0.0, 1.0, 201)
+    drive = calc_ramp(u, config.ramp, floor, up=False, down=True)
+    turn = calc_ramp(u, config.ramp, floor, up=True, down=True)
+    v_z = np.tan(slope) * config.v_x_max
+    # The curl starts slowly too; its plateau makes up for that, so that the integral over the segment stays.
+    rescale = np.trapezoid(1.0 / turn, u) / np.trapezoid(1.0 / drive, u)
+    omega = rescale * psi_s2 * v_z / h_s2 if h_s2 > 0 else 0.0
+    omega = min(omega, kin.bucket_speed)
+    return _Tables(
+        SpeedTable(u * length, config.v_x_max * drive),
+        SpeedTable(u * h_s2, v_z * drive),
+        SpeedTable(u * psi_s2, omega * turn),
+        n_lift,
+    )
+
+
+def _integrate_lift(
+    tables: _Tables, phi_l: float, phi_b: float, kin: Kinematics, config: PlanningConfig
+) -> _Path:
+    """Integrate [s1, s2] as the controller would drive it on a machine that follows exactly."""
+    length, height = tables.v_x.at[-1], tables.v_z.at[-1]
+    psi_end = tables.omega.at[-1]
+    dt = length / config.v_x_max / config.n_segment
+    z0 = float(calc_tip(kin, 0.0, phi_l, phi_b)[1])
+    rows = [(0.0, 0.0, 0.0, phi_l, phi_b, 0.0)]
+    x = z = psi = t = 0.0
+    while x < length - 1e-9 and z < height - 1e-9:
+        v_x = tables.v_x.calc(x)
+        step = min(dt, (length - x) / v_x)
+        v_z = tables.v_z.calc(z)
+        omega = tables.omega.calc(psi) if psi < psi_end else 0.0
+        step_turn = min(omega * step, psi_end - psi) if psi_end > 0 else 0.0
+        _, d_l, d_b = calc_joint_rates(kin, phi_l, phi_b, v_x * step, v_z * step, step_turn)
+        phi_l = max(phi_l + d_l, float(kin.phi_l_range[0]))
+        stop, _ = calc_bucket_range(kin, phi_l)
+        phi_b = max(phi_b + d_b, float(stop))
+        x, t = x + v_x * step, t + step
+        psi = float(calc_pitch(kin, phi_l, phi_b))
+        z = float(calc_tip(kin, 0.0, phi_l, phi_b)[1]) - z0
+        rows.append((x, z, psi, phi_l, phi_b, t))
+    return _Path(*np.array(rows).T)
+
+
+def _assemble(
+    x_s0: float,
+    depth: float,
+    dig: _Path,
+    tables: _Tables,
+    kin: Kinematics,
+    config: PlanningConfig,
+    *,
+    y: float,
+    slope: float,
+    h_s2: float,
+    psi_m: float,
+    volume: float,
+    volume_wanted: float,
+    reached: bool,
+    swept: shapely.Geometry,
+) -> DigPlan:
+    n, n_lift = config.n_segment, tables.n_lift
+    u = np.linspace(0.0, 1.0, n + 1)
+    x_s1 = x_s0 + depth
+    t_s1 = depth / config.v_x_max
+    x_s3, x_s4 = x_s1 + dig.x[-1], x_s0 - kin.bucket_length
+    t_s3 = t_s1 + dig.t[-1]
+    t_s4 = t_s3 + abs(x_s3 - x_s4) / config.v_x_max
+    x = np.concatenate([x_s0 + u * depth, x_s1 + dig.x[1:], (x_s3 + u * (x_s4 - x_s3))[1:]])
+    z = np.concatenate([np.zeros(n + 1), dig.z[1:], np.full(n, dig.z[-1])]) + config.floor_clearance
+    psi = np.concatenate([np.zeros(n + 1), dig.psi[1:], np.full(n, dig.psi[-1])])
+    phi_l = np.concatenate([np.full(n + 1, dig.phi_l[0]), dig.phi_l[1:], np.full(n, dig.phi_l[-1])])
+    phi_b = np.concatenate([np.full(n + 1, dig.phi_b[0]), dig.phi_b[1:], np.full(n, dig.phi_b[-1])])
+    t = np.concatenate([u * t_s1, t_s1 + dig.t[1:], (t_s3 + u * (t_s4 - t_s3))[1:]])
+    segment = np.repeat([0, 1, 2, 3], [n + 1, n_lift - 1, len(dig.x) - n_lift, n])
+    at = [0, n, n + n_lift - 1, n + len(dig.x) - 1, len(x) - 1]
+    largest = max(shapely.get_parts(swept), key=shapely.area)
+    return DigPlan(
+        y=y,
+        slope=slope,
+        h_s2=h_s2,
+        psi_m=psi_m,
+        volume=volume,
+        volume_wanted=volume_wanted,
+        reached=reached,
+        waypoint_x=x[at],
+        waypoint_z=z[at],
+        waypoint_psi=psi[at],
+        waypoint_t=t[at],
+        x=x,
+        z=z,
+        psi=psi,
+        phi_l=phi_l,
+        phi_b=phi_b,
+        t=t,
+        segment=segment,
+        v_x=SpeedTable(tables.v_x.at + x_s1, tables.v_x.speed),
+        v_z=SpeedTable(tables.v_z.at + config.floor_clearance, tables.v_z.speed),
+        omega=tables.omega,
+        drive_speed=config.v_x_max,
+        tilt_rate=config.tilt_rate,
+        swept=np.asarray(largest.exterior.coords),
+    )
+
+
+class DigPlanner(LeafSystem):
+    """Plans once, when the Diagram is initialised, from what the sensor sees then.
+
+    Input port:
+        ``height_field``: abstract, a `HeightField` in W.
+
+    Output port:
+        ``plan``: abstract, a `DigPlan` (or `NoPlan`); held in the Context.
+    """
+
+    def __init__(
+        self,
+        strategy: StrategyConfig,
+        machine: DiggingMachine,
+        config: PlanningConfig,
+        sensing: SensingConfig,
+        drift_width: float,
+        speed_floor: float,
+    ) -> None:
+        """Make the planner of one strategy."""
+        super().__init__()
+        self.set_name("dig_planner")
+        self._arguments = (strategy, machine, config, sensing, drift_width, speed_floor)
+        empty = HeightField(np.zeros(0), np.zeros(0), np.zeros((0, 0)), sensing.cell)
+        self._field = self.DeclareAbstractInputPort("height_field", AbstractValue.Make(empty))
+        self._plan = self.DeclareAbstractState(AbstractValue.Make(NoPlan("not initialised")))
+        self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)
+        self.DeclareStateOutputPort("plan", self._plan)
+
+    def _initialize(self, context: Context, state: State) -> None:
+        field = self._field.Eval(context)
+        state.get_mutable_abstract_state(int(self._plan)).set_value(make_dig_plan(field, *self._arguments))

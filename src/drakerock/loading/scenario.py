@@ -1,0 +1,51 @@
+"""A scenario: everything that one loading cycle depends on, as one YAML document."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from drakerock.config import Config, load_config
+from drakerock.dynamics.config import DynamicsConfig
+from drakerock.loading.config import LoadingConfig
+from drakerock.machine.config import MachineConfig
+from drakerock.pile.config import PileConfig, RocksConfig, SiteConfig
+from drakerock.resources import find_data
+
+
+class RecordingConfig(Config):
+    """What is kept for the replay."""
+
+    frame_rate: Annotated[float, Field(gt=0, le=100, description="frames per second [1/s]")] = 25.0
+    motion_threshold: Annotated[
+        float, Field(ge=0, le=0.1, description="a rock is drawn anew when it moved this far [m]")
+    ] = 0.01
+
+
+class Scenario(Config):
+    """Machine, site, rocks, pile, dynamics and loading of one cycle. All keys have defaults."""
+
+    seed: Annotated[int, Field(ge=0, description="of all randomness")] = 0
+    machine: MachineConfig = MachineConfig()
+    site: SiteConfig = SiteConfig()
+    rocks: RocksConfig = RocksConfig()
+    pile: PileConfig = PileConfig()
+    dynamics: DynamicsConfig = DynamicsConfig()
+    loading: LoadingConfig = LoadingConfig()
+    recording: RecordingConfig = RecordingConfig()
+
+
+def load_scenario(path: str | Path | None = None, overrides: Sequence[str] = ()) -> Scenario:
+    """Read a scenario.
+
+    Args:
+        path: a YAML file; None means the shipped ``studies/demo.yaml``.
+        overrides: ``"dotted.key=value"`` strings on top of it.
+
+    Raises:
+        InputError: see `drakerock.config.load_config`.
+    """
+    return load_config(path or find_data("studies", "demo.yaml"), Scenario, overrides)

@@ -1,0 +1,85 @@
+"""The time-stamped signals of a cycle as one table, with units."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from pydrake.systems.framework import Context
+
+from drakerock.dynamics.interface import ROCK_SUMMARY
+from drakerock.errors import InputError
+from drakerock.loading.station import Station
+from drakerock.machine.measurement import MEASUREMENT
+from drakerock.machine.names import WHEEL_JOINTS
+
+Array = NDArray[np.float64]
+
+FORCE_NAMES = ("bucket_torque_x", "bucket_torque_y", "bucket_torque_z",
+               "bucket_force_x", "bucket_force_y", "bucket_force_z")  # fmt: skip
+
+
+def calc_signals(station: Station, root_context: Context) -> tuple[dict[str, Array], dict[str, str]]:
+    """Return the columns (k,) of all logged steps, and their units.
+
+    A row holds what is so when the step at ``time`` begins and the forces that act over that step. Powers are
+    motor torque times joint rate, work its sum over time since the start, slip the difference of the wheels'
+    circumferential speed and the front unit's.
+    """
+    data = {name: log.FindLog(root_context).data() for name, log in station.logs.items()}
+    time = station.logs["mode"].FindLog(root_context).sample_times()
+    columns: dict[str, Array] = {"time": time, "mode": data["mode"][0]}
+    units: dict[str, str] = {"time": "s", "mode": "1"}
+
+    def add(names: dict[str, str], rows: Array) -> None:
+        for (name, unit), row in zip(names.items(), rows, strict=True):
+            columns[name], units[name] = row, unit
+
+    add(MEASUREMENT, data["measurement"])
+    add(
+        dict.fromkeys(("target_wheel_rate", "target_boom_rate", "target_bucket_rate"), "rad/s"),
+        data["motor_speeds"],
+    )
+    add({"hinge_moment": "N m"}, data["hinge_moment"])
+    add(dict.fromkeys(FORCE_NAMES[:3], "N m") | dict.fromkeys(FORCE_NAMES[3:], "N"), data["F_B_W"])
+    add(ROCK_SUMMARY, data["rock_summary"])
+
+    plant, instance = station.plant, station.machine.instance
+    n_q = plant.num_positions(instance)
+    full = np.arange(plant.num_velocities(), dtype=float)
+    row_of_velocity = {int(v): k for k, v in enumerate(plant.GetVelocitiesFromArray(instance, full))}
+    # Net actuation is ordered as the instance's actuators.
+    joints = [plant.get_joint_actuator(k).joint() for k in plant.GetJointActuatorIndices(instance)]
+    row_of_torque = {joint.name(): k for k, joint in enumerate(joints)}
+    row_of_rate = {joint.name(): row_of_velocity[joint.velocity_start()] for joint in joints}
+    groups = {"wheels": WHEEL_JOINTS, "boom": ("boom_joint",), "bucket": ("bucket_joint",)}
+    step = station.scenario.dynamics.time_step
+    total = np.zeros_like(time)
+    for name, members in groups.items():
+        torque = data["torques"][[row_of_torque[joint] for joint in members]]
+        rate = data["machine_state"][n_q:][[row_of_rate[joint] for joint in members]]
+        columns[f"torque_{name}"], units[f"torque_{name}"] = torque.sum(axis=0), "N m"
+        power = (torque * rate).sum(axis=0)
+        columns[f"power_{name}"], units[f"power_{name}"] = power, "W"
+        total += power
+    columns["work"], units["work"] = np.concatenate([[0.0], np.cumsum(total[:-1]) * step]), "J"
+    wheel_speed = columns["wheel_rate"] * station.digger.kinematics.wheel_radius
+    columns["wheel_slip"], units["wheel_slip"] = wheel_speed - columns["v_F"], "m/s"
+    return columns, units
+
+
+def save_signals(columns: dict[str, Array], units: dict[str, str], path: str | Path) -> None:
+    """Write the columns as Parquet; each column's unit is in its field's metadata under ``unit``.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    schema = pa.schema([pa.field(name, pa.float64(), metadata={"unit": units[name]}) for name in columns])
+    table = pa.table([pa.array(column) for column in columns.values()], schema=schema)
+    try:
+        pq.write_table(table, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error}") from None

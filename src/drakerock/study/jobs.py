@@ -1,0 +1,78 @@
+"""Single jobs: a scenario in; a folder with a pile, or with one loading cycle, out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from drakerock.dynamics.settling import PileRecipe, get_pile
+from drakerock.loading.cycle import CycleOutcome, make_folder, run_cycle, save_cycle, write_text
+from drakerock.loading.scenario import Scenario
+from drakerock.pile.shapes import load_rock_shapes
+from drakerock.pile.state import save_pile
+from drakerock.pile.summary import calc_summary
+from drakerock.viewing.pile_figures import write_pile_picture
+from drakerock.viewing.replay import write_replay
+
+
+def make_recipe(scenario: Scenario) -> PileRecipe:
+    """Return what the scenario's pile depends on."""
+    return PileRecipe(
+        seed=scenario.seed,
+        site=scenario.site,
+        rocks=scenario.rocks,
+        pile=scenario.pile,
+        dynamics=scenario.dynamics,
+    )
+
+
+def run_and_save(
+    scenario: Scenario, folder: Path, progress: Callable[..., None]
+) -> tuple[CycleOutcome, list[Path]]:
+    """Get the pile, run the cycle, write its files and the replay.
+
+    Args:
+        scenario: the configuration.
+        folder: where to write.
+        progress: called with stage, share in [0, 1] or None, and a note.
+
+    Raises:
+        InputError: bad configuration, or the folder cannot be written.
+        SimulationFailure: the pile could not be made.
+    """
+    make_folder(folder)
+    pile, _ = get_pile(make_recipe(scenario), progress)
+    result = run_cycle(
+        scenario, pile, lambda mode, time: progress(mode.lower(), None, note=f"{time:.1f} s simulated")
+    )
+    progress("writing", None)
+    paths = save_cycle(result, folder)
+    if result.recording is not None:
+        write_replay(result.recording, folder / "replay.html")
+        paths.append(folder / "replay.html")
+    return result.outcome, paths
+
+
+def make_pile_files(
+    scenario: Scenario, folder: Path, progress: Callable[..., None]
+) -> tuple[dict[str, Any], list[Path]]:
+    """Make or fetch the scenario's pile and write pile.npz, pile.json and pile.png.
+
+    Returns:
+        The summary, and the paths written.
+
+    Raises:
+        InputError: bad configuration, or the folder cannot be written.
+        SimulationFailure: the pile could not be made.
+    """
+    make_folder(folder)
+    pile, source = get_pile(make_recipe(scenario), progress)
+    shapes = load_rock_shapes(scenario.rocks.shapes)
+    summary = calc_summary(pile, shapes, scenario.rocks) | {"taken_from": str(source)}
+    paths = [folder / "pile.npz", folder / "pile.json", folder / "pile.png"]
+    save_pile(pile, paths[0])
+    write_text(paths[1], json.dumps(summary | {"provenance": pile.provenance}, indent=2) + "\n")
+    write_pile_picture(pile, shapes, scenario.site, paths[2])
+    return summary, paths

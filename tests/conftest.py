@@ -1,0 +1,78 @@
+"""Fixtures shared by all tests."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from pydrake.systems.framework import DiagramBuilder
+
+from drakerock.dynamics.assembly import add_plant
+from drakerock.dynamics.config import DynamicsConfig
+from drakerock.loading.planning import DiggingMachine
+from drakerock.loading.scenario import Scenario
+from drakerock.machine.config import MachineConfig
+from drakerock.machine.geometry import make_bucket_geometry
+from drakerock.machine.kinematics import make_kinematics
+from drakerock.machine.model import add_machine
+from drakerock.pile.config import RocksConfig
+from drakerock.pile.shapes import RockShape, load_rock_shapes
+from drakerock.pile.state import PileState
+
+settings.register_profile("drakerock", deadline=None, max_examples=30, derandomize=True)
+settings.load_profile("drakerock")
+
+
+@pytest.fixture(scope="session")
+def shapes() -> tuple[RockShape, ...]:
+    return load_rock_shapes(RocksConfig().shapes)
+
+
+@pytest.fixture(scope="session")
+def digger() -> DiggingMachine:
+    """The default machine's geometry, as the planner needs it."""
+    builder = DiagramBuilder()
+    plant, scene_graph = add_plant(builder, DynamicsConfig())
+    machine = add_machine(plant, MachineConfig())
+    plant.Finalize()
+    return DiggingMachine(
+        make_kinematics(plant, machine), make_bucket_geometry(plant, scene_graph, machine), 3.1
+    )
+
+
+@pytest.fixture
+def heap() -> PileState:
+    """Twelve rocks in a row of three layers on the floor, apart by a hair."""
+    rng = np.random.default_rng(3)
+    p_WRs = np.array(
+        [
+            [-1.0 - 0.5 * i, 0.45 * (j - 1), 0.25 + 0.5 * k]
+            for i in range(2)
+            for j in range(3)
+            for k in range(2)
+        ]
+    )
+    q_WRs = rng.normal(size=(12, 4))
+    q_WRs /= np.linalg.norm(q_WRs, axis=1)[:, None]
+    return PileState(
+        p_WRs,
+        q_WRs,
+        np.zeros((12, 6)),
+        np.arange(12) % 6,
+        np.full(12, 0.3),
+        np.zeros(12, bool),
+        {"made_by": "test"},
+    )
+
+
+@pytest.fixture(scope="session")
+def small_scenario() -> Scenario:
+    """A scenario of few rocks that makes its pile in a few seconds."""
+    return Scenario.model_validate(
+        {
+            "seed": 5,
+            "site": {"drift_width": 3.9, "void_depth": 0.8},
+            "pile": {"rocks": 24, "emission_reach": 1.6, "settle_speed": 0.2},
+            "loading": {"strategy": {"alpha": 0.3, "beta": 0.4, "gamma": 1.0, "kappa": 0.5}},
+        }
+    )
