@@ -79,7 +79,7 @@ def write_machine_page(config: MachineConfig, path: str | Path, *, contact_shape
 
 
 def _make_tour(kin: Kinematics) -> Array:
-    """Return rows (x of the front axle, phi_l, phi_b): forward, then round the border of the workspace, back."""
+    """Return rows (x of the front axle, phi_l, phi_b): forward, round the workspace's border, back."""
     inset = 1e-3
     level_l, level_b = (float(angle) for angle in calc_joint_angles(kin, 0.0, 0.0))
     top, bottom = kin.phi_l_range[0] + inset, kin.phi_l_range[1] - inset

@@ -1,0 +1,61 @@
+"""The machine's data, measured; and the measurement itself, measured on machines with a known fault."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from drakerock.config import load_config
+from drakerock.machine.checks import make_check_data, make_check_table, run_machine_checks
+from drakerock.machine.config import CheckConfig, MachineConfig, MotorConfig
+
+SMALL = load_config(Path(__file__).with_name("lhd_small.yaml"), MachineConfig)
+
+
+def get_failed(rows) -> set[str]:
+    return {row.name for row in rows if row.passed is False}
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return run_machine_checks(MachineConfig())
+
+
+def test_lhd_passes(rows):
+    assert get_failed(rows) == set()
+    assert sum(row.passed is True for row in rows) >= 24
+
+
+def test_another_machine_passes_without_a_line_of_code():
+    assert get_failed(run_machine_checks(SMALL)) == set()
+
+
+def test_lhd_with_similar_contact():
+    """In Drake's `similar` approximation sliding tyres are lifted off: wheels slip, but not all the time."""
+    rows = run_machine_checks(MachineConfig(), CheckConfig(contact_approximation="similar"))
+    assert get_failed(rows) <= {"wheels slip before they stall: slowest wheel"}
+
+
+def test_faults_are_found():
+    """A weak tilt motor, wheels that stall before they slip, and a payload too heavy for the boom."""
+    config = MachineConfig(
+        bucket=MotorConfig(effort=5e5), wheel=MotorConfig(effort=1.2e5), boom=MotorConfig(effort=7e5)
+    )
+    failed = get_failed(run_machine_checks(config))
+    assert {"breakout force, chassis held", "traction against a wall"} <= failed
+    assert "wheels slip before they stall: slowest wheel" in failed
+    assert "boom lifts 21 t: angle reached" in failed
+
+
+def test_table_and_data_say_the_same(rows):
+    text = io.StringIO()
+    Console(file=text, width=160).print(make_check_table(rows))
+    data = json.loads(json.dumps(make_check_data(rows)))
+    assert data["passed"] is True
+    assert len(data["checks"]) == len(rows)
+    for row in rows:
+        assert row.name in text.getvalue()
