@@ -139,7 +139,7 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
     return replace(pile, V_WRs=np.zeros_like(pile.V_WRs), provenance=provenance)
 
 
-def get_pile(recipe: PileRecipe, progress: Progress | None = None) -> tuple[PileState, Path]:
+def fetch_pile(recipe: PileRecipe, progress: Progress | None = None) -> tuple[PileState, Path]:
     """Return the recipe's pile and its file: the one `pile.source` names, or from the cache, or made now.
 
     Raises:

@@ -78,7 +78,7 @@ def test_speeds_never_fall_to_zero_before_the_waypoint(plan, digger):
     for x in np.linspace(plan.waypoint_x[1], plan.waypoint_x[2], 50):
         assert plan.v_x.calc(x) >= 0.1 * plan.drive_speed - 1e-12
     kin = digger.kinematics
-    stuck = calc_motor_speeds(plan, Mode.S1, kin, plan.waypoint_x[2] - 1e-6, plan.waypoint_z[2] - 1e-6, 9.0)
+    stuck = calc_motor_speeds(plan, Mode.S1, kin, plan.waypoint_x[2] - 1e-6, plan.v_z.at[-1] - 1e-6, 9.0)
     assert stuck[0] > 0
     assert stuck[1] < 0
 
