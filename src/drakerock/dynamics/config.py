@@ -4,9 +4,89 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from drakerock.config import Config
+
+
+class RestConfig(Config):
+    """When rocks come to rest and when they are woken (reduction: rest).
+
+    A resting rock is not solved and pairs of resting rocks are not searched; their contact impulses are kept.
+    """
+
+    displacement: Annotated[
+        float, Field(gt=0, description="a rock rests when it moved less than this [m] ...")
+    ] = 0.004
+    time: Annotated[float, Field(gt=0, description="... within this time [s]")] = 0.3
+    speed: Annotated[float, Field(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
+    wake_load: Annotated[
+        float,
+        Field(
+            gt=0,
+            description="it wakes when its contact impulses' sum has changed by this multiple of its weight's",
+        ),
+    ] = 1.0
+    wake_steps: Annotated[int, Field(ge=1, description="... for this many steps on end")] = 3
+    sensor_length: Annotated[
+        float, Field(ge=0, le=10, description="rocks this far in front of the bucket are awake [m]")
+    ] = 2.0
+    sensor_margin: Annotated[
+        float, Field(ge=0, le=5, description="... and this far from it to the other sides [m]")
+    ] = 0.3
+
+
+class NonsmoothConfig(Config):
+    """The nonsmooth engine: stepper, contact solve, collision margins, reduction."""
+
+    iterations: Annotated[int, Field(ge=1, le=2000, description="sweeps of the resting stage")] = 50
+    impact_iterations: Annotated[int, Field(ge=1, le=500, description="sweeps of the impact stage")] = 10
+    impact_threshold: Annotated[
+        float, Field(gt=0, description="contacts that approach faster are impacts [m/s]")
+    ] = 0.1
+    damping_time: Annotated[
+        float, Field(ge=0, description="SPOOK's tau, time in which overlaps decay [time steps]")
+    ] = 4.5
+    stiffness_factor: Annotated[
+        float,
+        Field(
+            gt=0,
+            description="on Hertz's stiffness of two balls of the rocks' sieve widths, modulus and Poisson ratio",
+        ),
+    ] = 1.0
+    max_recovery_speed: Annotated[
+        float, Field(gt=0, description="overlaps are pushed apart at most this fast [m/s]")
+    ] = 1.0
+    rounding: Annotated[
+        float, Field(gt=0, le=0.1, description="rounding of the rocks' edges [sieve width]")
+    ] = 0.03
+    contact_margin: Annotated[
+        float, Field(gt=0, le=0.2, description="contacts are found this far ahead of touching [m]")
+    ] = 0.01
+    manifold_gap: Annotated[
+        float, Field(ge=0, le=0.2, description="corners of faces that touch count up to this gap [m]")
+    ] = 0.005
+    face_cosine: Annotated[
+        float, Field(gt=0, le=1, description="faces touch if this well aligned with the contact's normal")
+    ] = 0.985
+    reduction: Literal["none", "rest"] = "rest"
+    rest: RestConfig = RestConfig()
+    max_residual: Annotated[
+        float,
+        Field(gt=0, description="a step with more is solved again with more iterations, and flagged"),
+    ] = 0.2
+    max_penetration: Annotated[
+        float, Field(gt=0, description="overlaps beyond it are flagged [m]")
+    ] = 0.04
+    memory_per_rock: Annotated[
+        int, Field(ge=3, le=50, description="loaded contact points that can be kept, per rock")
+    ] = 5
+
+    @model_validator(mode="after")
+    def _check_margins(self) -> NonsmoothConfig:
+        if self.manifold_gap > self.contact_margin:
+            raise ValueError("manifold_gap must not be above contact_margin")
+        return self
 
 
 class PlantEngineConfig(Config):
@@ -21,7 +101,7 @@ class PlantEngineConfig(Config):
 class DynamicsConfig(Config):
     """Time stepping and contact of the whole Diagram."""
 
-    rocks: Annotated[Literal["plant"], Field(description="the engine that moves the rocks")] = "plant"
+    rocks: Annotated[Literal["plant", "nonsmooth"], Field(description="the engine that moves the rocks")] = "plant"
     time_step: Annotated[float, Field(gt=1e-4, le=0.05, description="[s]")] = 0.01
     contact_approximation: Annotated[
         Literal["similar", "lagged", "sap"], Field(description="Drake's discrete contact approximation")
@@ -31,3 +111,4 @@ class DynamicsConfig(Config):
         float, Field(gt=0, le=0.05, description="overlap at which the contact stiffness is taken [m]")
     ] = 1e-3
     plant: PlantEngineConfig = PlantEngineConfig()
+    nonsmooth: NonsmoothConfig = NonsmoothConfig()

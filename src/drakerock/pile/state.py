@@ -1,4 +1,4 @@
-"""PileState: the pose, velocity, shape and size of every rock, and its file format."""
+"""PileState: the pose, velocity, shape and size of every rock, its contacts, and its file format."""
 
 from __future__ import annotations
 
@@ -13,7 +13,61 @@ from drakerock.npz import load_arrays, save_arrays
 
 Array = NDArray[np.float64]
 FORMAT = "drakerock-pile"
-VERSION = 1
+VERSION = 2
+
+
+@dataclass(frozen=True, eq=False)
+class ContactMemory:
+    """The loaded contact points of a pile at rest: its force network, so that a stored pile starts warm.
+
+    Attributes:
+        pairs: (c, 2) indices of the rocks in contact, the lower first; -1, -2, ... as the second stand for the
+            site's pieces, then its planes. Points of one pair are in line.
+        points: (c, 3) positions in the frame of the pair's first rock [m].
+        impulses: (c, 3) impulse of a time step on the second, in W [N s].
+        resting: (n,) True for rocks that the model reduction had at rest.
+    """
+
+    pairs: NDArray[np.int64]
+    points: Array
+    impulses: Array
+    resting: NDArray[np.bool_]
+
+    def select(self, rocks: NDArray[np.int64], n: int) -> ContactMemory:
+        """Return the contacts among the chosen rocks (indices into n rocks), renumbered.
+
+        Pairs whose rocks change order are left out, since points belong to the first rock's frame.
+        """
+        number = np.full(n, -1, np.int64)
+        number[rocks] = np.arange(len(rocks))
+        first, second = self.pairs.T if len(self.pairs) else np.zeros((2, 0), np.int64)
+        new_first = number[first]
+        new_second = np.where(second < 0, second, number[np.maximum(second, 0)])
+        kept = (new_first >= 0) & ((second < 0) | (new_second > new_first))
+        return ContactMemory(
+            np.column_stack([new_first, new_second])[kept],
+            self.points[kept],
+            self.impulses[kept],
+            self.resting[rocks],
+        )
+
+    def join(self, other: ContactMemory) -> ContactMemory:
+        """Return the contacts of both piles, the other's rocks numbered after this one's."""
+        shift = len(self.resting)
+        pairs = np.where(other.pairs < 0, other.pairs, other.pairs + shift)
+        return ContactMemory(
+            np.concatenate([self.pairs, pairs]),
+            np.concatenate([self.points, other.points]),
+            np.concatenate([self.impulses, other.impulses]),
+            np.concatenate([self.resting, other.resting]),
+        )
+
+
+def make_empty_contacts(n: int) -> ContactMemory:
+    """Return the memory of n rocks without contacts."""
+    return ContactMemory(
+        np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(n, np.bool_)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +82,7 @@ class PileState:
         size: (n,) sieve widths [m].
         fixed: (n,) True for the rocks of the static rear boundary.
         provenance: where the pile comes from (scenario hash, seed, versions, what was done to it).
+        contacts: the force network it was stored with, if any.
     """
 
     p_WRs: Array
@@ -37,6 +92,7 @@ class PileState:
     size: Array
     fixed: NDArray[np.bool_]
     provenance: dict[str, Any] = field(default_factory=dict)
+    contacts: ContactMemory | None = None
 
     def __post_init__(self) -> None:
         n = len(self.p_WRs)
@@ -54,6 +110,8 @@ class PileState:
                 raise ValueError(f"{name}: shape {array.shape} instead of {form}")
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 raise ValueError(f"{name}: not finite")
+        if self.contacts is not None:
+            _check_contacts(self.contacts, n)
 
     def __len__(self) -> int:
         """Return the number of rocks, static ones included."""
@@ -62,14 +120,21 @@ class PileState:
     def select(self, rocks: NDArray[Any]) -> PileState:
         """Return the pile of the rocks chosen by an index or mask array (n,)."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rocks] for name in _ARRAYS}
-        return replace(self, **arrays)
+        contacts = None
+        if self.contacts is not None:
+            contacts = self.contacts.select(np.arange(len(self))[rocks], len(self))
+        return replace(self, **arrays, contacts=contacts)
 
     def join(self, other: PileState) -> PileState:
         """Return the pile of the rocks of both, this one's first; the provenance is this one's."""
         arrays: dict[str, Any] = {
             name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _ARRAYS
         }
-        return replace(self, **arrays)
+        contacts = None
+        if self.contacts is not None or other.contacts is not None:
+            first = self.contacts or make_empty_contacts(len(self))
+            contacts = first.join(other.contacts or make_empty_contacts(len(other)))
+        return replace(self, **arrays, contacts=contacts)
 
     def calc_masses(self, shape_volumes: Array, density: float) -> Array:
         """Return the masses (n,) [kg], given the shapes' volumes at sieve width 1 (k,) [m^3]."""
@@ -77,6 +142,20 @@ class PileState:
 
 
 _ARRAYS = ("p_WRs", "q_WRs", "V_WRs", "shape", "size", "fixed")
+_CONTACT_ARRAYS = ("pairs", "points", "impulses", "resting")
+
+
+def _check_contacts(contacts: ContactMemory, n: int) -> None:
+    c = len(contacts.pairs)
+    expected = {"pairs": (c, 2), "points": (c, 3), "impulses": (c, 3), "resting": (n,)}
+    for name, form in expected.items():
+        array = getattr(contacts, name)
+        if array.shape != form:
+            raise ValueError(f"contacts.{name}: shape {array.shape} instead of {form}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"contacts.{name}: not finite")
+    if c and not ((contacts.pairs[:, 0] >= 0).all() and (contacts.pairs < n).all()):
+        raise ValueError("contacts.pairs: a rock that is not in the pile")
 
 
 def make_empty_pile() -> PileState:
@@ -89,6 +168,8 @@ def make_empty_pile() -> PileState:
 def save_pile(pile: PileState, path: str | Path) -> None:
     """Write a pile as a versioned npz with a checksum; InputError if the file cannot be written."""
     arrays = {name: getattr(pile, name) for name in _ARRAYS}
+    if pile.contacts is not None:
+        arrays |= {f"contact_{name}": getattr(pile.contacts, name) for name in _CONTACT_ARRAYS}
     save_arrays(path, FORMAT, VERSION, {"provenance": pile.provenance}, arrays)
 
 
@@ -99,4 +180,9 @@ def load_pile(path: str | Path) -> PileState:
         InputError: missing, foreign, damaged, or of a newer version.
     """
     header, arrays = load_arrays(path, FORMAT, VERSION)
-    return PileState(**{name: arrays[name] for name in _ARRAYS}, provenance=header["provenance"])
+    contacts = None
+    if "contact_pairs" in arrays:
+        contacts = ContactMemory(**{name: arrays[f"contact_{name}"] for name in _CONTACT_ARRAYS})
+    return PileState(
+        **{name: arrays[name] for name in _ARRAYS}, provenance=header["provenance"], contacts=contacts
+    )

@@ -1,0 +1,1 @@
+"""Collision: from poses to contact points with gaps and normals."""

@@ -1,0 +1,173 @@
+"""Contact manifolds: up to four points per pair, so that faces rest on faces.
+
+The face of one body that points best along the normal is the reference; the other body's face is clipped
+against the reference's sides (Sutherland and Hodgman) and the corners that remain, with their gaps, are
+thinned to four points that are far apart.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drakerock.dynamics.nonsmooth.collision.geometry import get_corner, rotate, rotate_back
+from drakerock.dynamics.nonsmooth.compiling import kernel
+
+MAX_OUTLINE = 96
+MAX_POINTS = 4
+
+
+@kernel
+def make_manifold_workspace():
+    """Return (outline, clipped, candidates): two outlines (MAX_OUTLINE, 3) and points with gaps (.., 4)."""
+    return np.zeros((MAX_OUTLINE, 3)), np.zeros((MAX_OUTLINE, 3)), np.zeros((MAX_OUTLINE, 4))
+
+
+@kernel
+def _find_face(shapes, shape, r, x, y, z):
+    """Return the face of a core whose normal is nearest to (x, y, z) in W, and the cosine between them."""
+    lx, ly, lz = rotate_back(r, x, y, z)
+    best = -2.0
+    index = shapes.face_start[shape]
+    normals = shapes.face_normals
+    for face in range(shapes.face_start[shape], shapes.face_start[shape + 1]):
+        cosine = normals[face, 0] * lx + normals[face, 1] * ly + normals[face, 2] * lz
+        if cosine > best:
+            best = cosine
+            index = face
+    return index, best
+
+
+@kernel
+def _clip(outline, n_points, clipped, px, py, pz, nx, ny, nz):
+    """Cut away the part of an outline outside the plane through p with outward normal n; return the length."""
+    n_kept = 0
+    for k in range(n_points):
+        follower = k + 1 if k + 1 < n_points else 0
+        d0 = (outline[k, 0] - px) * nx + (outline[k, 1] - py) * ny + (outline[k, 2] - pz) * nz
+        d1 = (
+            (outline[follower, 0] - px) * nx
+            + (outline[follower, 1] - py) * ny
+            + (outline[follower, 2] - pz) * nz
+        )
+        if d0 <= 0.0:
+            for d in range(3):
+                clipped[n_kept, d] = outline[k, d]
+            n_kept += 1
+        if (d0 < 0.0 < d1) or (d1 < 0.0 < d0):
+            t = d0 / (d0 - d1)
+            for d in range(3):
+                clipped[n_kept, d] = outline[k, d] + t * (outline[follower, d] - outline[k, d])
+            n_kept += 1
+    for k in range(n_kept):
+        for d in range(3):
+            outline[k, d] = clipped[k, d]
+    return n_kept
+
+
+@kernel
+def add_spread_points(candidates, n_candidates, points, n_points, min_distance):
+    """Add to the manifold `points` (4, 4) those candidates that are farthest from the points it has.
+
+    Returns the number of points.
+    """
+    while n_points < MAX_POINTS:
+        best = min_distance * min_distance
+        chosen = -1
+        for k in range(n_candidates):
+            nearest2 = np.inf
+            for j in range(n_points):
+                dx = candidates[k, 0] - points[j, 0]
+                dy = candidates[k, 1] - points[j, 1]
+                dz = candidates[k, 2] - points[j, 2]
+                nearest2 = min(nearest2, dx * dx + dy * dy + dz * dz)
+            if nearest2 > best:
+                best = nearest2
+                chosen = k
+        if chosen < 0:
+            break
+        for d in range(4):
+            points[n_points, d] = candidates[chosen, d]
+        n_points += 1
+    return n_points
+
+
+@kernel
+def make_manifold(
+    shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, nx, ny, nz,
+    max_gap, min_cosine, points, workspace,
+):  # fmt: skip
+    """Extend the nearest point of a pair to a manifold of at most four points.
+
+    Args:
+        shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz: as for `calc_core_distance`.
+        nx, ny, nz: unit normal from A to B.
+        max_gap: points farther apart than this are left out [m].
+        min_cosine: a face belongs to the contact if its normal is within this cosine of the pair's.
+        points: (4, 4) positions (half way between the surfaces, from A's origin) and gaps; row 0 holds the
+            nearest point on entry, rows 1 to 3 are set.
+        workspace: from `make_manifold_workspace`.
+
+    Returns:
+        the number of points, 1 to 4.
+    """
+    face_a, cosine_a = _find_face(shapes, shape_a, r_a, nx, ny, nz)
+    face_b, cosine_b = _find_face(shapes, shape_b, r_b, -nx, -ny, -nz)
+    if max(cosine_a, cosine_b) < min_cosine:
+        return 1
+    outline, clipped, candidates = workspace
+    # The reference's frame and the incident body's frame, both from A's origin.
+    if cosine_a >= cosine_b:
+        reference, incident, sign = face_a, face_b, 1.0
+        ref_scale, ref_r, rx, ry, rz = scale_a, r_a, 0.0, 0.0, 0.0
+        inc_scale, inc_r, ix, iy, iz = scale_b, r_b, px, py, pz
+        inc_rounding = scale_b * shapes.rounding[shape_b]
+    else:
+        reference, incident, sign = face_b, face_a, -1.0
+        ref_scale, ref_r, rx, ry, rz = scale_b, r_b, px, py, pz
+        inc_scale, inc_r, ix, iy, iz = scale_a, r_a, 0.0, 0.0, 0.0
+        inc_rounding = scale_a * shapes.rounding[shape_a]
+    roundings = scale_a * shapes.rounding[shape_a] + scale_b * shapes.rounding[shape_b]
+    normals = shapes.face_normals
+    fx, fy, fz = rotate(ref_r, normals[reference, 0], normals[reference, 1], normals[reference, 2])
+    first, last = shapes.face_vertex_start[incident], shapes.face_vertex_start[incident + 1]
+    n_outline = last - first
+    for k in range(n_outline):
+        x, y, z = get_corner(shapes, shapes.face_vertices[first + k], inc_scale, inc_r)
+        outline[k, 0], outline[k, 1], outline[k, 2] = x + ix, y + iy, z + iz
+    first, last = shapes.face_vertex_start[reference], shapes.face_vertex_start[reference + 1]
+    ax, ay, az = get_corner(shapes, shapes.face_vertices[last - 1], ref_scale, ref_r)
+    for k in range(first, last):
+        bx, by, bz = get_corner(shapes, shapes.face_vertices[k], ref_scale, ref_r)
+        ex, ey, ez = bx - ax, by - ay, bz - az
+        n_outline = _clip(
+            outline, n_outline, clipped, ax + rx, ay + ry, az + rz,
+            ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx,
+        )  # fmt: skip
+        if n_outline == 0:
+            return 1
+        ax, ay, az = bx, by, bz
+    ax, ay, az = ax + rx, ay + ry, az + rz
+    # Gaps are measured along the pair's normal, between the incident corner and the reference's plane.
+    along = sign * (fx * nx + fy * ny + fz * nz)
+    n_candidates = 0
+    deepest = -1
+    for k in range(n_outline):
+        x, y, z = outline[k, 0], outline[k, 1], outline[k, 2]
+        gap = ((x - ax) * fx + (y - ay) * fy + (z - az) * fz) / along - roundings
+        if gap < max_gap:
+            shift = -sign * (inc_rounding + 0.5 * gap)
+            candidates[n_candidates, 0] = x + shift * nx
+            candidates[n_candidates, 1] = y + shift * ny
+            candidates[n_candidates, 2] = z + shift * nz
+            candidates[n_candidates, 3] = gap
+            if deepest < 0 or gap < candidates[deepest, 3]:
+                deepest = n_candidates
+            n_candidates += 1
+    if n_candidates == 0:
+        return 1
+    # Where a face carries, its corners do; the nearest point, which wanders over parallel faces, is dropped.
+    if n_candidates >= 3 and candidates[deepest, 3] < points[0, 3] + 1e-3:
+        for d in range(4):
+            points[0, d] = candidates[deepest, d]
+    spread = 0.2 * min(scale_a * shapes.radius[shape_a], scale_b * shapes.radius[shape_b])
+    return add_spread_points(candidates, n_candidates, points, 1, spread)

@@ -1,0 +1,293 @@
+"""Narrow phase: from pairs of bodies to contact rows with positions, gaps and last step's impulses."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drakerock.dynamics.nonsmooth.collision.geometry import (
+    calc_support_distance,
+    get_corner,
+    get_rotation,
+    make_tangents,
+    rotate_back,
+)
+from drakerock.dynamics.nonsmooth.collision.gjk import (
+    OVERLAPPING,
+    SEPARATED,
+    calc_core_distance,
+    make_gjk_workspace,
+)
+from drakerock.dynamics.nonsmooth.collision.manifold import (
+    MAX_POINTS,
+    add_spread_points,
+    make_manifold,
+    make_manifold_workspace,
+)
+from drakerock.dynamics.nonsmooth.collision.overlap import calc_core_penetration
+from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.contacts import (
+    ARM_A,
+    ARM_B,
+    FRICTION,
+    GAP,
+    IMPULSE,
+    KEY_STEP,
+    MEMORY_IMPULSE,
+    MEMORY_KEY,
+    MEMORY_POINT,
+    NORMAL,
+    RESTITUTION,
+    TANGENT_1,
+    TANGENT_2,
+    find_axis,
+    find_in_memory,
+)
+
+# A pair that overlaps deeply may turn its normal from the direction it was pushed in by at most 60 degrees.
+MIN_COSINE_TO_HISTORY = 0.5
+# A way per step from which on all corners of a rock count against plates and other solid pieces [m].
+FAST = 0.03
+
+
+@kernel
+def _find_plane_points(shapes, shape, scale, r, x, y, z, plane, max_gap, points, candidates):
+    """Set the manifold of a rock on a plane: its corners within `max_gap`, the deepest first, then spread."""
+    rounding = scale * shapes.rounding[shape]
+    height = plane[0] * x + plane[1] * y + plane[2] * z - plane[3] - rounding
+    lx, ly, lz = rotate_back(r, plane[0], plane[1], plane[2])
+    n_candidates = 0
+    deepest = 0
+    for k in range(shapes.vertex_start[shape], shapes.vertex_start[shape + 1]):
+        along = lx * shapes.vertices[k, 0] + ly * shapes.vertices[k, 1] + lz * shapes.vertices[k, 2]
+        gap = height + scale * along
+        if gap < max_gap and n_candidates < len(candidates):
+            cx, cy, cz = get_corner(shapes, k, scale, r)
+            shift = rounding + 0.5 * gap
+            candidates[n_candidates, 0] = cx - shift * plane[0]
+            candidates[n_candidates, 1] = cy - shift * plane[1]
+            candidates[n_candidates, 2] = cz - shift * plane[2]
+            candidates[n_candidates, 3] = gap
+            if gap < candidates[deepest, 3]:
+                deepest = n_candidates
+            n_candidates += 1
+    if n_candidates == 0:
+        return 0
+    for d in range(4):
+        points[0, d] = candidates[deepest, d]
+    return add_spread_points(candidates, n_candidates, points, 1, 0.2 * scale * shapes.radius[shape])
+
+
+@kernel
+def _add_fast_points(shapes, shape, scale, r, nx, ny, nz, offset, max_gap, points, n_points, candidates):
+    """Add the corners of a fast rock that can reach the plane ``n p = offset`` of what it is about to hit.
+
+    A rock that strikes with one corner would be spun through a thin plate within the step; with rows for its
+    other corners it lands on them.
+    """
+    rounding = scale * shapes.rounding[shape]
+    n_candidates = 0
+    for k in range(shapes.vertex_start[shape], shapes.vertex_start[shape + 1]):
+        cx, cy, cz = get_corner(shapes, k, scale, r)
+        gap = offset - rounding - (nx * cx + ny * cy + nz * cz)
+        if gap < max_gap and n_candidates < len(candidates):
+            shift = rounding + 0.5 * gap
+            candidates[n_candidates, 0] = cx + shift * nx
+            candidates[n_candidates, 1] = cy + shift * ny
+            candidates[n_candidates, 2] = cz + shift * nz
+            candidates[n_candidates, 3] = gap
+            n_candidates += 1
+    return add_spread_points(candidates, n_candidates, points, n_points, 0.2 * scale * shapes.radius[shape])
+
+
+@kernel
+def find_contacts(
+    pair_a, pair_b, n_pairs, n_rocks, first_plane, first_piece, planes, shapes, shape, scale,
+    positions, rotations, velocities, solver_body, friction, restitution,
+    time_step, margin, manifold_gap, face_cosine,
+    memory, table, axis_keys, axes, rows, body_a, body_b, row_key, row_rock, statistics,
+):  # fmt: skip
+    """Find the contact points of all pairs.
+
+    Bodies are numbered rocks, static pieces, planes, pieces of the machine. `solver_body` maps them to the
+    bodies of the solve: rocks to themselves, all that stands still to `n_rocks`, machine bodies beyond.
+
+    Args:
+        pair_a, pair_b, n_pairs: pairs from the broad phase, first a rock.
+        n_rocks, first_plane, first_piece: where statics, planes and machine pieces start (statics at n_rocks).
+        planes: (p, 4).
+        shapes, shape, scale: all shapes; per body its shape and scale.
+        positions, rotations: per body [m].
+        velocities: (solver bodies, 6) angular, translational, at the last step.
+        solver_body: per body.
+        friction: per body, its own coefficient; a pair has 2 a b / (a + b).
+        restitution: (2,) rock against rock or site, rock against machine.
+        time_step: [s]; pairs that can meet within it get contacts beforehand.
+        margin: contacts are found up to this gap [m].
+        manifold_gap: further points of a pair up to this gap [m].
+        face_cosine: see `make_manifold`.
+        memory, table: loaded points of the last step, see `contacts`.
+        axis_keys, axes: cache of separating axes: skips pairs, never changes a result.
+        rows, body_a, body_b, row_key, row_rock: set, see `contacts`.
+        statistics: (4,) set: pairs skipped, distances computed, overlapping cores, rows.
+
+    Returns:
+        number of rows; beyond the capacity they are counted but not stored.
+    """
+    gjk_workspace = make_gjk_workspace()
+    manifold_workspace = make_manifold_workspace()
+    points = np.zeros((MAX_POINTS, 4))
+    n_rows = 0
+    statistics[:] = 0
+    for pair in range(n_pairs):
+        a, b = pair_a[pair], pair_b[pair]
+        key = a * KEY_STEP + b
+        shape_a, scale_a = shape[a], scale[a]
+        r_a = get_rotation(rotations, a)
+        body_1, body_2 = solver_body[a], solver_body[b]
+        speed2 = 0.0
+        for d in range(3, 6):
+            speed2 += (velocities[body_1, d] - velocities[body_2, d]) ** 2
+        spin_a = math.sqrt(velocities[a, 0] ** 2 + velocities[a, 1] ** 2 + velocities[a, 2] ** 2)
+        reach = math.sqrt(speed2) + spin_a * scale_a * shapes.radius[shape_a]
+        remembered = find_in_memory(key, memory, table)
+        if first_plane <= b < first_piece:
+            plane = planes[b - first_plane]
+            nx, ny, nz = -plane[0], -plane[1], -plane[2]
+            n_points = _find_plane_points(
+                shapes, shape_a, scale_a, r_a, positions[a, 0], positions[a, 1], positions[a, 2], plane,
+                margin + time_step * reach, points, manifold_workspace[2],
+            )  # fmt: skip
+            if n_points == 0:
+                continue
+        else:
+            shape_b, scale_b = shape[b], scale[b]
+            r_b = get_rotation(rotations, b)
+            spin_b = math.sqrt(
+                velocities[body_2, 0] ** 2 + velocities[body_2, 1] ** 2 + velocities[body_2, 2] ** 2
+            )
+            reach += spin_b * scale_b * shapes.radius[shape_b]
+            max_gap = margin + time_step * reach
+            roundings = scale_a * shapes.rounding[shape_a] + scale_b * shapes.rounding[shape_b]
+            px, py, pz = (
+                positions[b, 0] - positions[a, 0],
+                positions[b, 1] - positions[a, 1],
+                positions[b, 2] - positions[a, 2],
+            )
+            place, known = find_axis(key, axis_keys)
+            if known:
+                gx, gy, gz = float(axes[place, 0]), float(axes[place, 1]), float(axes[place, 2])
+                along = (
+                    gx * px
+                    + gy * py
+                    + gz * pz
+                    - calc_support_distance(shapes, shape_a, scale_a, r_a, gx, gy, gz)
+                    - calc_support_distance(shapes, shape_b, scale_b, r_b, -gx, -gy, -gz)
+                )
+                limit = roundings + max_gap
+                if along > 0.0 and along * along > limit * limit * (gx * gx + gy * gy + gz * gz):
+                    statistics[0] += 1
+                    continue
+            # The direction in which the pair pushed last starts the search.
+            hx, hy, hz = 0.0, 0.0, 0.0
+            if remembered >= 0:
+                row = remembered
+                while row < len(memory) and int(memory[row, MEMORY_KEY]) == key:
+                    hx += memory[row, MEMORY_IMPULSE]
+                    hy += memory[row, MEMORY_IMPULSE + 1]
+                    hz += memory[row, MEMORY_IMPULSE + 2]
+                    row += 1
+            length = math.sqrt(hx * hx + hy * hy + hz * hz)
+            if length > 0.0:
+                hx, hy, hz = hx / length, hy / length, hz / length
+                gx, gy, gz = hx, hy, hz
+            else:
+                gx, gy, gz = px, py, pz
+                if gx * gx + gy * gy + gz * gz < 1e-12:
+                    gx = 1.0
+            statistics[1] += 1
+            status, vx, vy, vz, ax, ay, az = calc_core_distance(
+                shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, gx, gy, gz,
+                roundings + max_gap, gjk_workspace,
+            )  # fmt: skip
+            if status == SEPARATED:
+                axis_keys[place] = key
+                axes[place, 0], axes[place, 1], axes[place, 2] = vx, vy, vz
+                continue
+            if status == OVERLAPPING:
+                statistics[2] += 1
+                distance, nx, ny, nz, ax, ay, az = calc_core_penetration(
+                    shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, hx, hy, hz,
+                    MIN_COSINE_TO_HISTORY,
+                )  # fmt: skip
+            else:
+                distance = math.sqrt(vx * vx + vy * vy + vz * vz)
+                nx, ny, nz = vx / distance, vy / distance, vz / distance
+            gap = distance - roundings
+            shift = scale_a * shapes.rounding[shape_a] + 0.5 * gap
+            points[0, 0], points[0, 1], points[0, 2] = ax + shift * nx, ay + shift * ny, az + shift * nz
+            points[0, 3] = gap
+            n_points = make_manifold(
+                shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, nx, ny, nz,
+                max(manifold_gap, gap), face_cosine, points, manifold_workspace,
+            )  # fmt: skip
+            if b >= n_rocks and time_step * reach > FAST:
+                offset = nx * ax + ny * ay + nz * az + distance - scale_b * shapes.rounding[shape_b]
+                n_points = _add_fast_points(
+                    shapes, shape_a, scale_a, r_a, nx, ny, nz, offset, max_gap, points, n_points,
+                    manifold_workspace[2],
+                )  # fmt: skip
+        tx, ty, tz, ux, uy, uz = make_tangents(nx, ny, nz)
+        mu = 2.0 * friction[a] * friction[b] / (friction[a] + friction[b])
+        match_limit = 0.3 * scale_a * shapes.radius[shape_a]
+        used = 0
+        for k in range(n_points):
+            if n_rows >= len(rows):
+                n_rows += 1
+                continue
+            x, y, z = points[k, 0], points[k, 1], points[k, 2]
+            normal, tangent_1, tangent_2 = 0.0, 0.0, 0.0
+            if remembered >= 0:
+                lx, ly, lz = rotate_back(r_a, x, y, z)
+                nearest = match_limit * match_limit
+                found = -1
+                row = remembered
+                while row < len(memory) and int(memory[row, MEMORY_KEY]) == key:
+                    distance2 = (
+                        (memory[row, MEMORY_POINT] - lx) ** 2
+                        + (memory[row, MEMORY_POINT + 1] - ly) ** 2
+                        + (memory[row, MEMORY_POINT + 2] - lz) ** 2
+                    )
+                    if distance2 < nearest and (used >> (row - remembered)) & 1 == 0:
+                        nearest = distance2
+                        found = row
+                    row += 1
+                if found >= 0:
+                    used |= 1 << (found - remembered)
+                    ix, iy, iz = (
+                        memory[found, MEMORY_IMPULSE],
+                        memory[found, MEMORY_IMPULSE + 1],
+                        memory[found, MEMORY_IMPULSE + 2],
+                    )
+                    normal = max(ix * nx + iy * ny + iz * nz, 0.0)
+                    tangent_1 = ix * tx + iy * ty + iz * tz
+                    tangent_2 = ix * ux + iy * uy + iz * uz
+            out = rows[n_rows]
+            out[NORMAL], out[NORMAL + 1], out[NORMAL + 2] = nx, ny, nz
+            out[TANGENT_1], out[TANGENT_1 + 1], out[TANGENT_1 + 2] = tx, ty, tz
+            out[TANGENT_2], out[TANGENT_2 + 1], out[TANGENT_2 + 2] = ux, uy, uz
+            out[ARM_A], out[ARM_A + 1], out[ARM_A + 2] = x, y, z
+            out[ARM_B] = x + positions[a, 0] - positions[b, 0]
+            out[ARM_B + 1] = y + positions[a, 1] - positions[b, 1]
+            out[ARM_B + 2] = z + positions[a, 2] - positions[b, 2]
+            out[FRICTION] = mu
+            out[GAP] = points[k, 3]
+            out[RESTITUTION] = restitution[1] if body_2 > n_rocks else restitution[0]
+            out[IMPULSE], out[IMPULSE + 1], out[IMPULSE + 2] = normal, tangent_1, tangent_2
+            body_a[n_rows], body_b[n_rows] = body_1, body_2
+            row_key[n_rows] = key
+            row_rock[n_rows] = a
+            n_rows += 1
+    statistics[3] = n_rows
+    return n_rows

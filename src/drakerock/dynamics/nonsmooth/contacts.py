@@ -1,0 +1,151 @@
+"""Contact rows and the memory of contacts: what a contact point is, and how it is found again.
+
+Memory holds the loaded points of the last step: the pair's key, the point in the frame of the pair's first
+rock and the impulse in W. It is what makes a stored pile start warm and what a resting pile's force network
+is kept in.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drakerock.dynamics.nonsmooth.compiling import kernel
+
+# Columns of a contact row. All vectors in W; impulses act on body B, and reversed on body A.
+NORMAL = 0  # 0..2 unit normal from A to B
+TANGENT_1 = 3  # 3..5
+TANGENT_2 = 6  # 6..8
+ARM_A = 9  # 9..11 from A's origin to the point
+ARM_B = 12  # 12..14 from B's origin to the point
+NORMAL_MASS = 15  # 1 / (normal row's diagonal + compliance)
+COUPLING_1 = 16  # normal impulse -> velocity along tangent 1
+COUPLING_2 = 17
+TANGENT_MASS = 18  # 18..20 inverse of the tangential 2 x 2 block: 11 12 22
+BIAS = 21  # normal velocity aimed at
+COMPLIANCE = 22
+FRICTION = 23
+IMPULSE = 24  # 24..26 normal, tangent 1, tangent 2 [N s]
+GAP = 27
+RESTITUTION = 28
+TANGENT_STEP = 29  # 2 / trace of the tangential block
+ROW_WIDTH = 32
+
+# Columns of the memory.
+MEMORY_KEY = 0
+MEMORY_POINT = 1  # 1..3
+MEMORY_IMPULSE = 4  # 4..6
+MEMORY_WIDTH = 7
+
+# A pair's key is first * KEY_STEP + second: exact in a double.
+KEY_STEP = 1 << 20
+
+
+@kernel
+def _hash(key, mask):
+    return ((key * -7046029254386353131) >> 40) & mask
+
+
+@kernel
+def index_memory(memory, n_memory, table):
+    """Set a hash table from a pair's key to the first of its rows in memory (rows of a pair are in line).
+
+    Args:
+        memory: (.., MEMORY_WIDTH).
+        n_memory: number of rows.
+        table: (2**k,) set; -1 where empty; must have more places than pairs.
+    """
+    table[:] = -1
+    mask = len(table) - 1
+    last = -1
+    for row in range(n_memory):
+        key = int(memory[row, MEMORY_KEY])
+        if key != last:
+            place = _hash(key, mask)
+            while table[place] >= 0:
+                place = (place + 1) & mask
+            table[place] = row
+            last = key
+
+
+@kernel
+def find_in_memory(key, memory, table):
+    """Return the first row of a pair in memory, or -1."""
+    mask = len(table) - 1
+    place = _hash(key, mask)
+    while table[place] >= 0:
+        if int(memory[table[place], MEMORY_KEY]) == key:
+            return table[place]
+        place = (place + 1) & mask
+    return -1
+
+
+@kernel
+def find_axis(key, axis_keys):
+    """Return the place of a pair in the cache of separating axes, and whether it is the pair's own."""
+    place = _hash(key, len(axis_keys) - 1)
+    return place, axis_keys[place] == key
+
+
+@kernel
+def write_memory(
+    n_rocks, status, old, n_old, rows, n_rows, row_key, row_rock, rotations, new
+):
+    """Write the memory of the coming step: the loaded points just solved, and all points between rocks at rest.
+
+    Args:
+        n_rocks: number of rocks.
+        status: (n,) of each rock, see `broad_phase`; 0 is awake.
+        old, n_old: memory of the last step and its length.
+        rows, n_rows: contact rows after the solve.
+        row_key, row_rock: per row the pair's key and its first rock.
+        rotations: (n, 3, 3) of the rocks at the poses of the solve.
+        new: (capacity, MEMORY_WIDTH) set.
+
+    Returns:
+        the number of points; beyond the capacity they are counted but lost.
+    """
+    n_new = 0
+    for row in range(n_old):
+        key = int(old[row, MEMORY_KEY])
+        a, b = key // KEY_STEP, key % KEY_STEP
+        if status[a] == 0 or (b < n_rocks and status[b] == 0):
+            continue
+        if status[a] == 3 or (b < n_rocks and status[b] == 3):
+            continue
+        if n_new < len(new):
+            for d in range(MEMORY_WIDTH):
+                new[n_new, d] = old[row, d]
+        n_new += 1
+    for k in range(n_rows):
+        row = rows[k]
+        normal, tangent_1, tangent_2 = row[IMPULSE], row[IMPULSE + 1], row[IMPULSE + 2]
+        if normal <= 0.0:
+            continue
+        if n_new < len(new):
+            a = row_rock[k]
+            new[n_new, MEMORY_KEY] = row_key[k]
+            for d in range(3):
+                new[n_new, MEMORY_POINT + d] = (
+                    rotations[a, 0, d] * row[ARM_A]
+                    + rotations[a, 1, d] * row[ARM_A + 1]
+                    + rotations[a, 2, d] * row[ARM_A + 2]
+                )
+                new[n_new, MEMORY_IMPULSE + d] = (
+                    normal * row[NORMAL + d] + tangent_1 * row[TANGENT_1 + d] + tangent_2 * row[TANGENT_2 + d]
+                )
+        n_new += 1
+    return n_new
+
+
+@kernel
+def sum_impulses(memory, n_memory, n_rocks, sums):
+    """Set `sums` (n, 3) to the sum of the contact impulses on each rock [N s]."""
+    sums[:] = 0.0
+    for row in range(n_memory):
+        key = int(memory[row, MEMORY_KEY])
+        a, b = key // KEY_STEP, key % KEY_STEP
+        for d in range(3):
+            sums[a, d] -= memory[row, MEMORY_IMPULSE + d]
+        if b < n_rocks:
+            for d in range(3):
+                sums[b, d] += memory[row, MEMORY_IMPULSE + d]

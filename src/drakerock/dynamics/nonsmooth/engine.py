@@ -1,0 +1,628 @@
+"""The engine: one step of all rocks, from state arrays to state arrays.
+
+`NonsmoothEngine` holds what does not change during a simulation (shapes, masses, the site, settings) and scratch
+memory that never changes a result. All state is in a `RockArrays`, which callers own.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drakerock.dynamics.config import NonsmoothConfig
+from drakerock.dynamics.nonsmooth import contacts, motion, reduction, solver
+from drakerock.dynamics.nonsmooth.collision import broad_phase, narrow_phase
+from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, FIXED, LOST, RESTING
+from drakerock.dynamics.nonsmooth.collision.shapes import make_convex_shapes
+from drakerock.dynamics.nonsmooth.compiling import announce_compilation
+from drakerock.dynamics.nonsmooth.solver import MachineArrays
+from drakerock.errors import SimulationFailure
+from drakerock.pile.config import RocksConfig
+from drakerock.pile.shapes import RockShape
+from drakerock.pile.site import Site
+from drakerock.pile.state import ContactMemory, PileState
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+_log = logging.getLogger(__name__)
+
+GRAVITY = 9.81
+# How far outside the site's box a rock still counts as inside [m].
+SITE_MARGIN = 0.5
+# A step that failed is solved again with this many times the iterations, from a cold start.
+RETRY_FACTOR = 4
+
+
+@dataclass(frozen=True)
+class MachinePiece:
+    """A convex piece of a machine body that touches rocks.
+
+    Attributes:
+        body: number of the body among the machine's bodies that touch rocks.
+        vertices: (k, 3) in the body's frame [m].
+        friction: its coefficient; a pair has 2 a b / (a + b).
+    """
+
+    body: int
+    vertices: Array
+    friction: float
+
+
+@dataclass(frozen=True, eq=False)
+class MachineStep:
+    """The machine over the coming step, as the contact solve needs it (v velocities, b bodies, m rows).
+
+    Attributes:
+        X_WBs: (b, 4, 4) poses of the bodies that touch rocks.
+        velocity: (v,) generalised velocities now.
+        free_change: (v,) their change over the step without rocks and without the forces of the rows.
+        arrays: Jacobians, responses and rows.
+        sensors: (k, 18) boxes that keep rocks awake: rotation by rows, position, lower, upper corner.
+    """
+
+    X_WBs: Array
+    velocity: Array
+    free_change: Array
+    arrays: MachineArrays
+    sensors: Array
+
+
+@dataclass(eq=False)
+class RockArrays:
+    """All state of n rocks (the arrays of a step's result are new).
+
+    Attributes:
+        quaternions: (n, 4) w x y z.
+        positions: (n, 3) [m].
+        velocities: (n, 6) angular, translational in W.
+        book: (n, reduction.BOOK_WIDTH) status and bookkeeping of the reduction.
+        memory: (capacity, contacts.MEMORY_WIDTH) loaded contact points.
+        n_memory: how many of them count.
+    """
+
+    quaternions: Array
+    positions: Array
+    velocities: Array
+    book: Array
+    memory: Array
+    n_memory: int
+
+
+@dataclass(frozen=True, eq=False)
+class StepReport:
+    """What a step did.
+
+    Attributes:
+        F_Bs_W: (b, 6) spatial impulse over time step of the rocks on each machine body at its origin, in W:
+            torque [N m], force [N].
+        machine_velocity: (v,) the machine's generalised velocities as the contact solve left them.
+        n_awake: rocks awake in the step.
+        n_contacts: contact points; n_loaded of them carry load.
+        residual: last sweep's change of the normal impulses over their sum.
+        max_penetration, p99_penetration: of loaded points [m].
+        n_woken, n_rested, n_lost: rocks that changed state (lost: left the site) in this step.
+        redone: the step was solved again with more iterations.
+        overflow: loaded points that memory could not take.
+    """
+
+    F_Bs_W: Array
+    machine_velocity: Array
+    n_awake: int
+    n_contacts: int
+    n_loaded: int
+    residual: float
+    max_penetration: float
+    p99_penetration: float
+    n_woken: int
+    n_rested: int
+    n_lost: int
+    redone: bool
+    overflow: int
+
+
+def make_machineless_step() -> MachineStep:
+    """Return the machine of a simulation without one."""
+    return MachineStep(
+        np.zeros((0, 4, 4)),
+        np.zeros(0),
+        np.zeros(0),
+        MachineArrays(
+            np.zeros((0, 6, 0)),
+            np.zeros((0, 0, 6)),
+            np.zeros((0, 6, 6)),
+            np.zeros((0, 0)),
+            np.zeros((0, 0)),
+            np.zeros((0, solver.MACHINE_ROW_WIDTH)),
+        ),
+        np.zeros((0, 18)),
+    )
+
+
+class NonsmoothEngine:
+    """Steps a given set of rocks on a given site, with the pieces of a machine if there is one.
+
+    Args:
+        rocks: material.
+        shapes: the scenario's rock shapes.
+        site: planes and convex pieces.
+        config: settings.
+        time_step: [s].
+        shape, size, fixed: (n,) of the rocks, as in a `PileState`.
+        pieces: the machine's.
+        n_machine_bodies: number of machine bodies.
+        gravity: [m/s^2], along -z.
+    """
+
+    def __init__(
+        self,
+        rocks: RocksConfig,
+        shapes: Sequence[RockShape],
+        site: Site,
+        config: NonsmoothConfig,
+        time_step: float,
+        shape: IntArray,
+        size: Array,
+        fixed: NDArray[np.bool_],
+        pieces: Sequence[MachinePiece] = (),
+        n_machine_bodies: int = 0,
+        gravity: float = GRAVITY,
+    ) -> None:
+        announce_compilation()
+        self.config = config
+        self.time_step = time_step
+        self.n_rocks = n = len(size)
+        self.shape_index = np.asarray(shape, np.int64)
+        self.size = np.asarray(size, float)
+        self.fixed = np.asarray(fixed, bool)
+        self.gravity = gravity
+        n_shapes, n_static, n_planes = len(shapes), len(site.pieces), len(site.planes)
+        self.convex = make_convex_shapes(
+            [item.vertices for item in shapes]
+            + [item.vertices for item in site.pieces]
+            + [item.vertices for item in pieces],
+            [config.rounding] * n_shapes + [0.0] * (n_static + len(pieces)),
+        )
+        self.planes = np.array([[*plane.normal, plane.offset] for plane in site.planes], float).reshape(-1, 4)
+
+        # Bodies: rocks, static pieces, planes, pieces of the machine.
+        self.first_plane = n + n_static
+        self.first_piece = n + n_static + n_planes
+        n_bodies = self.first_piece + len(pieces)
+        if n_bodies >= contacts.KEY_STEP:
+            raise ValueError(f"{n_bodies} bodies: more than {contacts.KEY_STEP - 1} cannot be told apart")
+        self.shape = np.zeros(n_bodies, np.int64)
+        self.shape[:n] = self.shape_index
+        self.shape[n : self.first_plane] = n_shapes + np.arange(n_static)
+        self.shape[self.first_piece :] = n_shapes + n_static + np.arange(len(pieces))
+        self.scale = np.ones(n_bodies)
+        self.scale[:n] = self.size
+        self.friction = np.full(n_bodies, site.config.friction)
+        self.friction[:n] = rocks.friction
+        self.friction[self.first_piece :] = [piece.friction for piece in pieces]
+        self.restitution = np.array([rocks.restitution, rocks.restitution_machine])
+        self.piece_body = np.array([piece.body for piece in pieces], np.int64)
+        self.n_machine_bodies = n_machine_bodies
+        self.solver_body = np.full(n_bodies, n, np.int64)
+        self.solver_body[:n] = np.arange(n)
+        self.solver_body[self.first_piece :] = n + 1 + self.piece_body
+
+        # Masses and inertias of the true shapes, not of the rounded ones.
+        volume = np.array([item.volume for item in shapes])
+        inertia = np.array([np.linalg.inv(item.inertia) for item in shapes])
+        self.mass = rocks.density * volume[self.shape_index] * self.size**3
+        self.inverse_mass = 1.0 / self.mass
+        inverse = inertia[self.shape_index] / (rocks.density * self.size**5)[:, None, None]
+        self.inverse_inertia_local = np.ascontiguousarray(inverse.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
+        self.radius = self.size * self.convex.radius[self.shape_index]
+        self.curvature = np.zeros(n + 1 + n_machine_bodies)
+        self.curvature[:n] = 2.0 / self.size
+        effective_modulus = 0.5 * rocks.elastic_modulus / (1.0 - rocks.poisson_ratio**2)
+        self.hertz = config.stiffness_factor * 4.0 / 3.0 * effective_modulus
+
+        self._lower_site, self._upper_site = _calc_site_box(site)
+        self._grids = _make_grid_classes(self.radius)
+        self._make_scratch(n_bodies)
+
+    def _make_scratch(self, n_bodies: int) -> None:
+        n = self.n_rocks
+        self.capacity = self.config.memory_per_rock * n + 1024
+        self._positions = np.zeros((n_bodies, 3))
+        self._rotations = np.tile(np.eye(3), (n_bodies, 1, 1))
+        self._lower = np.full((n_bodies, 3), np.inf)
+        self._upper = np.full((n_bodies, 3), -np.inf)
+        self._inverse_inertia = np.zeros((n, 6))
+        self._posed = np.full((n, 7), np.nan)
+        self._bodies = np.zeros((n + 1, solver.BODY_WIDTH))
+        self._velocities = np.zeros((n + 1 + self.n_machine_bodies, 6))
+        self._marks = np.zeros(n + 1 + self.n_machine_bodies, np.int64)
+        self._table = np.zeros(1 << int(np.ceil(np.log2(2 * self.capacity))), np.int64)
+        # Places for the pairs that are near but apart; what is pushed out is searched anew, no more.
+        places = 1 << int(np.ceil(np.log2(max(16 * n, 1024))))
+        self._axis_keys = np.full(places, -1, np.int64)
+        self._axes = np.zeros((places, 3), np.float32)
+        self._statistics = np.zeros(4, np.int64)
+        self._sums = np.zeros((n, 3))
+        self._cell_start = np.zeros(2, np.int64)
+        self._allocate_pairs(20 * n + 256)
+        self._allocate_rows(6 * n + 256)
+        for k in range(n, self.first_plane):
+            vertices = self._get_vertices(self.shape[k])
+            self._lower[k], self._upper[k] = vertices.min(axis=0), vertices.max(axis=0)
+
+    def _get_vertices(self, shape: int) -> Array:
+        start = self.convex.vertex_start
+        return self.convex.vertices[start[shape] : start[shape + 1]]
+
+    def _allocate_pairs(self, capacity: int) -> None:
+        self._pair_a = np.zeros(capacity, np.int64)
+        self._pair_b = np.zeros(capacity, np.int64)
+
+    def _allocate_rows(self, capacity: int) -> None:
+        self._rows = np.zeros((capacity, contacts.ROW_WIDTH))
+        self._body_a = np.zeros(capacity, np.int64)
+        self._body_b = np.zeros(capacity, np.int64)
+        self._row_key = np.zeros(capacity, np.int64)
+        self._row_rock = np.zeros(capacity, np.int64)
+        self._impacts = np.zeros((capacity, 3))
+
+    # ---- state in and out
+
+    def make_arrays(self, pile: PileState) -> RockArrays:
+        """Return the state arrays of a pile; rocks that are marked as resting in its contacts stay resting.
+
+        Raises:
+            ValueError: not the rocks this engine was made for.
+        """
+        if not (
+            np.array_equal(pile.shape, self.shape_index)
+            and np.array_equal(pile.size, self.size)
+            and np.array_equal(pile.fixed, self.fixed)
+        ):
+            raise ValueError("the pile's rocks are not those this engine was made for")
+        n = self.n_rocks
+        book = np.zeros((n, reduction.BOOK_WIDTH))
+        book[:, reduction.STATUS] = np.where(self.fixed, FIXED, AWAKE)
+        book[:, reduction.ANCHOR : reduction.ANCHOR + 3] = pile.p_WRs
+        memory = np.zeros((self.capacity, contacts.MEMORY_WIDTH))
+        n_memory = 0
+        if pile.contacts is not None:
+            n_memory = self._fill_memory(pile.contacts, memory)
+            if self.config.reduction == "rest":
+                resting = pile.contacts.resting & ~self.fixed
+                book[resting, reduction.STATUS] = RESTING
+                sums = np.zeros((n, 3))
+                contacts.sum_impulses(memory, n_memory, n, sums)
+                book[resting, reduction.REFERENCE : reduction.REFERENCE + 3] = sums[resting]
+        velocities = pile.V_WRs.copy()
+        velocities[book[:, reduction.STATUS] != AWAKE] = 0.0
+        # Stored unit quaternions keep their bits.
+        length = np.linalg.norm(pile.q_WRs, axis=1, keepdims=True)
+        arrays = RockArrays(
+            np.where(np.abs(length - 1.0) < 1e-14, pile.q_WRs, pile.q_WRs / length),
+            pile.p_WRs.copy(),
+            velocities,
+            book,
+            memory,
+            n_memory,
+        )
+        book[self._find_lost(arrays.positions) & ~self.fixed, reduction.STATUS] = LOST
+        return arrays
+
+    def make_pile(self, arrays: RockArrays, provenance: dict[str, object] | None = None) -> PileState:
+        """Return the pile of state arrays, contact memory included."""
+        rows = arrays.memory[: arrays.n_memory]
+        keys = rows[:, contacts.MEMORY_KEY].astype(np.int64)
+        pairs = np.column_stack([keys // contacts.KEY_STEP, keys % contacts.KEY_STEP])
+        kept = pairs[:, 1] < self.first_piece  # the machine's are not the pile's
+        pairs, rows = pairs[kept], rows[kept]
+        # Surfaces of the site are -1, -2, ...: independent of the number of rocks.
+        surface = pairs[:, 1] >= self.n_rocks
+        pairs[surface, 1] = self.n_rocks - 1 - pairs[surface, 1]
+        memory = ContactMemory(
+            pairs,
+            rows[:, contacts.MEMORY_POINT : contacts.MEMORY_POINT + 3].copy(),
+            rows[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3].copy(),
+            arrays.book[:, reduction.STATUS] == RESTING,
+        )
+        return PileState(
+            arrays.positions.copy(),
+            arrays.quaternions.copy(),
+            arrays.velocities.copy(),
+            self.shape_index,
+            self.size,
+            self.fixed,
+            dict(provenance or {}),
+            memory,
+        )
+
+    def _fill_memory(self, stored: ContactMemory, memory: Array) -> int:
+        second = np.where(stored.pairs[:, 1] < 0, self.n_rocks - 1 - stored.pairs[:, 1], stored.pairs[:, 1])
+        known = second < self.first_piece
+        first, second = stored.pairs[known, 0], second[known]
+        n_memory = min(int(known.sum()), self.capacity)
+        memory[:n_memory, contacts.MEMORY_KEY] = (first * contacts.KEY_STEP + second)[:n_memory]
+        memory[:n_memory, contacts.MEMORY_POINT : contacts.MEMORY_POINT + 3] = stored.points[known][:n_memory]
+        memory[:n_memory, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3] = stored.impulses[known][
+            :n_memory
+        ]
+        return n_memory
+
+    def _find_lost(self, positions: Array) -> NDArray[np.bool_]:
+        outside = (positions < self._lower_site) | (positions > self._upper_site)
+        return np.asarray(outside.any(axis=1))
+
+    def place(self, arrays: RockArrays, rocks: IntArray, p_WRs: Array, V_WRs: Array) -> RockArrays:
+        """Return the state with rocks put at positions (m, 3) with velocities (m, 6), awake."""
+        new = replace(
+            arrays,
+            positions=arrays.positions.copy(),
+            velocities=arrays.velocities.copy(),
+            book=arrays.book.copy(),
+        )
+        new.positions[rocks] = p_WRs
+        new.velocities[rocks] = V_WRs
+        for rock in rocks:
+            reduction.wake_rock(new.book, new.positions, rock)
+        return new
+
+    # ---- the step
+
+    def advance(self, arrays: RockArrays) -> tuple[RockArrays, StepReport]:
+        """Step without a machine; see `step`."""
+        return self.step(arrays, make_machineless_step())
+
+    def step(self, arrays: RockArrays, machine: MachineStep) -> tuple[RockArrays, StepReport]:
+        """Advance all rocks by one time step, solved together with the machine.
+
+        Args:
+            arrays: state at t_n; not changed.
+            machine: the machine at t_n, see `MachineStep`.
+
+        Returns:
+            state at t_n + dt, and the report.
+
+        Raises:
+            SimulationFailure: the result is not finite, also when solved again more carefully.
+        """
+        iterations = self.config.iterations
+        new, report = self._try_step(arrays, machine, iterations, warm=True)
+        if new is not None and report is not None and report.residual <= self.config.max_residual:
+            return new, report
+        again, better = self._try_step(arrays, machine, RETRY_FACTOR * iterations, warm=new is not None)
+        if again is None or better is None:
+            raise SimulationFailure("rocks: the contact solve gave values that are not finite")
+        return again, _mark_redone(better)
+
+    def _try_step(
+        self, arrays: RockArrays, machine: MachineStep, iterations: int, warm: bool
+    ) -> tuple[RockArrays, StepReport] | tuple[None, None]:
+        config, n, dt = self.config, self.n_rocks, self.time_step
+        book = arrays.book.copy()
+        memory = arrays.memory[: arrays.n_memory]
+        n_woken = 0
+        if config.reduction == "rest":
+            contacts.sum_impulses(memory, arrays.n_memory, n, self._sums)
+            n_woken = reduction.wake(
+                book,
+                arrays.positions,
+                self.radius,
+                self.mass,
+                self._sums,
+                machine.sensors,
+                config.rest.wake_load * self.gravity * dt,
+                config.rest.wake_steps,
+            )
+        status = book[:, reduction.STATUS].astype(np.int64)
+        awake = np.flatnonzero(status == AWAKE)
+        self._velocities[:n] = arrays.velocities
+        self._velocities[n + 1 :] = machine.arrays.jacobian @ machine.velocity
+        self._pose(arrays, machine, awake)
+        motion.set_bodies(awake, arrays.velocities, self.inverse_mass, self._inverse_inertia, self._bodies)
+
+        n_pairs = self._find_pairs(status, awake)
+        contacts.index_memory(memory, arrays.n_memory, self._table)
+        n_rows = self._find_contacts(n_pairs, memory)
+        rows, body_a, body_b = self._rows, self._body_a, self._body_b
+        if not warm:
+            rows[:n_rows, contacts.IMPULSE : contacts.IMPULSE + 3] = 0.0
+
+        velocity = machine.velocity.copy()
+        machine.arrays.row_values[:, solver.ROW_IMPULSE] = 0.0
+        upsilon = 1.0 / (1.0 + 4.0 * config.damping_time)
+        solver.prepare_rows(
+            rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, self.curvature, self.hertz,
+            dt, upsilon, config.max_recovery_speed, config.impact_threshold,
+        )  # fmt: skip
+        n_impacts = 0
+        if self.restitution.any():
+            n_impacts = solver.solve_impacts(
+                rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, dt,
+                config.impact_threshold, config.impact_iterations, self._marks, self._impacts,
+            )  # fmt: skip
+        motion.add_gravity(awake, self._bodies, np.array([0.0, 0.0, -self.gravity * dt]))
+        velocity += machine.free_change
+        solver.apply_impulses(rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity)
+        residual = solver.solve_resting(
+            rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, iterations
+        )
+
+        new = RockArrays(
+            arrays.quaternions.copy(),
+            arrays.positions.copy(),
+            arrays.velocities.copy(),
+            book,
+            np.zeros_like(arrays.memory),
+            0,
+        )
+        sane = motion.move(
+            awake, self._bodies, self.inverse_inertia_local, dt, new.quaternions, new.positions, new.velocities
+        )
+        if not sane or not np.isfinite(velocity).all():
+            return None, None
+        n_memory = contacts.write_memory(
+            n, status, memory, arrays.n_memory, rows, n_rows, self._row_key, self._row_rock, self._rotations,
+            new.memory,
+        )  # fmt: skip
+        new.n_memory = min(n_memory, self.capacity)
+        contacts.sum_impulses(new.memory, new.n_memory, n, self._sums)
+        n_rested, n_lost = reduction.rest(
+            book, new.positions, new.velocities, self.radius, self._sums, machine.sensors, dt,
+            config.rest.displacement, config.rest.time, config.rest.speed, self._lower_site, self._upper_site,
+            config.reduction == "rest",
+        )  # fmt: skip
+        loaded = rows[:n_rows, contacts.IMPULSE] > 0.0
+        depths = -rows[:n_rows, contacts.GAP][loaded]
+        report = StepReport(
+            F_Bs_W=self._sum_machine_forces(n_rows, n_impacts > 0),
+            machine_velocity=velocity,
+            n_awake=len(awake),
+            n_contacts=n_rows,
+            n_loaded=int(loaded.sum()),
+            residual=residual,
+            max_penetration=float(depths.max(initial=0.0)),
+            p99_penetration=float(_calc_percentile(depths, 0.99)),
+            n_woken=n_woken,
+            n_rested=n_rested,
+            n_lost=n_lost,
+            redone=False,
+            overflow=n_memory - new.n_memory,
+        )
+        return new, report
+
+    def _pose(self, arrays: RockArrays, machine: MachineStep, awake: IntArray) -> None:
+        """Set positions, rotations and boxes: of awake rocks, of others that were moved, of the machine."""
+        n, dt, margin = self.n_rocks, self.time_step, self.config.contact_margin
+        self._positions[:n] = arrays.positions
+        poses = np.hstack([arrays.quaternions, arrays.positions])
+        stale = (poses != self._posed).any(axis=1)
+        stale[awake] = True
+        broad_phase.calc_poses(
+            self.shape, self.scale, arrays.quaternions, arrays.positions, arrays.velocities, dt, margin,
+            self.convex, np.flatnonzero(stale), self._rotations, self._lower, self._upper,
+            self.inverse_inertia_local, self._inverse_inertia,
+        )  # fmt: skip
+        self._posed = poses
+        broad_phase.calc_piece_boxes(
+            self.first_piece, self.piece_body, self.shape, self.convex, machine.X_WBs,
+            self._velocities[n + 1 :], dt, margin, self._positions, self._rotations, self._lower, self._upper,
+        )  # fmt: skip
+
+    def _find_pairs(self, status: IntArray, awake: IntArray) -> int:
+        n = self.n_rocks
+        pieces = np.arange(self.first_piece, self.first_piece + len(self.piece_body))
+        grids = [self._sort_grid(rocks, reach) for rocks, reach in self._grids]
+        while True:
+            n_pairs = 0
+            for items, *_ in grids:
+                seekers = items[status[items] == AWAKE]
+                for grid in grids:
+                    n_pairs = self._search(seekers, status, grid, n_pairs)
+            n_pairs = broad_phase.find_static_pairs(
+                awake, n, self.first_plane, self.planes, self._lower, self._upper,
+                self._pair_a, self._pair_b, n_pairs,
+            )  # fmt: skip
+            # The machine's pairs come last.
+            for grid in grids:
+                n_pairs = self._search(pieces, status, grid, n_pairs)
+            if n_pairs <= len(self._pair_a):
+                return n_pairs
+            self._allocate_pairs(n_pairs + n_pairs // 4)
+
+    def _sort_grid(
+        self, rocks: IntArray, reach: float
+    ) -> tuple[IntArray, Array, float, IntArray, IntArray, float]:
+        inverse_width = 1.0 / (1.3 * reach)
+        positions = self._positions[rocks]
+        origin = np.maximum(positions.min(axis=0), self._lower_site)
+        extent = np.minimum(positions.max(axis=0), self._upper_site) - origin
+        n_cells = np.maximum(np.ceil(extent * inverse_width), 1).astype(np.int64)
+        cell_start = np.empty(int(n_cells.prod()) + 1, np.int64)
+        items = np.empty(len(rocks), np.int64)
+        broad_phase.sort_into_grid(
+            rocks, self._positions, origin, inverse_width, n_cells, cell_start, np.empty_like(items), items
+        )
+        return items, origin, inverse_width, n_cells, cell_start, reach
+
+    def _search(
+        self,
+        seekers: IntArray,
+        status: IntArray,
+        grid: tuple[IntArray, Array, float, IntArray, IntArray, float],
+        n_pairs: int,
+    ) -> int:
+        items, origin, inverse_width, n_cells, cell_start, reach = grid
+        return int(
+            broad_phase.find_rock_pairs(
+                seekers, self.n_rocks, status, self._lower, self._upper, origin, inverse_width, n_cells,
+                cell_start, items, reach, self._pair_a, self._pair_b, n_pairs,
+            )
+        )  # fmt: skip
+
+    def _find_contacts(self, n_pairs: int, memory: Array) -> int:
+        config = self.config
+        while True:
+            n_rows = narrow_phase.find_contacts(
+                self._pair_a, self._pair_b, n_pairs, self.n_rocks, self.first_plane, self.first_piece,
+                self.planes, self.convex, self.shape, self.scale, self._positions, self._rotations,
+                self._velocities, self.solver_body, self.friction, self.restitution, self.time_step,
+                config.contact_margin, config.manifold_gap, config.face_cosine, memory, self._table,
+                self._axis_keys, self._axes, self._rows, self._body_a, self._body_b, self._row_key,
+                self._row_rock, self._statistics,
+            )  # fmt: skip
+            if n_rows <= len(self._rows):
+                return int(n_rows)
+            self._allocate_rows(n_rows + n_rows // 4)
+
+    def _sum_machine_forces(self, n_rows: int, with_impacts: bool) -> Array:
+        """Return (b, 6): the rocks' mean spatial force over the step on each machine body at its origin."""
+        forces = np.zeros((self.n_machine_bodies, 6))
+        chosen = np.flatnonzero(self._body_b[:n_rows] > self.n_rocks)
+        if len(chosen) == 0:
+            return forces
+        rows = self._rows[chosen]
+        impulses = np.einsum(
+            "kc,kcd->kd",
+            rows[:, contacts.IMPULSE : contacts.IMPULSE + 3],
+            rows[:, contacts.NORMAL : contacts.NORMAL + 9].reshape(-1, 3, 3),
+        )
+        if with_impacts:
+            impulses = impulses + self._impacts[chosen]
+        torques = np.cross(rows[:, contacts.ARM_B : contacts.ARM_B + 3], impulses)
+        body = self._body_b[chosen] - self.n_rocks - 1
+        np.add.at(forces, body, np.hstack([torques, impulses]) / self.time_step)
+        return forces
+
+
+def _mark_redone(report: StepReport) -> StepReport:
+    return StepReport(**{**report.__dict__, "redone": True})
+
+
+def _calc_percentile(values: Array, share: float) -> float:
+    """Return the value that `share` of the values are below (0 if there are none)."""
+    if len(values) == 0:
+        return 0.0
+    place = min(int(share * len(values)), len(values) - 1)
+    return float(np.partition(values, place)[place])
+
+
+def _calc_site_box(site: Site) -> tuple[Array, Array]:
+    """Return the corners of the box outside of which a rock has left the site [m]."""
+    config = site.config
+    half = 0.5 * config.drift_width + SITE_MARGIN
+    return (
+        np.array([-config.drift_length, -half, -SITE_MARGIN]),
+        np.array([config.void_depth + SITE_MARGIN, half, config.void_height + 20.0]),
+    )
+
+
+def _make_grid_classes(radius: Array) -> list[tuple[IntArray, float]]:
+    """Return the rocks by classes of size (a factor of two each) with the largest radius of each class [m]."""
+    if len(radius) == 0:
+        return []
+    level = np.floor(np.log2(radius / radius.min() * 1.0001)).astype(np.int64)
+    classes = [np.flatnonzero(level == k) for k in np.unique(level)]
+    return [(rocks, float(radius[rocks].max())) for rocks in classes]

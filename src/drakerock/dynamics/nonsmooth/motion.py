@@ -1,0 +1,130 @@
+"""The rocks' motion over a step: positions, rotations by the exponential map, free spin."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drakerock.dynamics.nonsmooth.collision.broad_phase import rotate_inertia
+from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.solver import INVERSE_INERTIA, INVERSE_MASS
+
+
+@kernel
+def turn(w, x, y, z, ax, ay, az):
+    """Return the unit quaternion q turned by the rotation vector a (in W): exp(a) q."""
+    angle2 = ax * ax + ay * ay + az * az
+    half = 0.5 * math.sqrt(angle2)
+    # sin(h) / (2 h), by its series where h is small
+    factor = math.sin(half) / (2.0 * half) if half > 1e-6 else 0.5 - angle2 / 48.0
+    c, u, v, s = math.cos(half), factor * ax, factor * ay, factor * az
+    nw = c * w - u * x - v * y - s * z
+    nx = c * x + u * w + v * z - s * y
+    ny = c * y + v * w + s * x - u * z
+    nz = c * z + s * w + u * y - v * x
+    scale = 1.0 / math.sqrt(nw * nw + nx * nx + ny * ny + nz * nz)
+    return nw * scale, nx * scale, ny * scale, nz * scale
+
+
+@kernel
+def _make_rotation(w, x, y, z):
+    return (
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@kernel
+def _solve_symmetric(m, i, x, y, z):
+    """Return M^-1 (x, y, z) for row i of symmetric matrices (xx xy xz yy yz zz)."""
+    a, b, c, d, e, f = m[i, 0], m[i, 1], m[i, 2], m[i, 3], m[i, 4], m[i, 5]
+    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
+    scale = 1.0 / (a * c00 + b * c01 + c * c02)
+    c11, c12, c22 = a * f - c * c, b * c - a * e, a * d - b * b
+    return (
+        scale * (c00 * x + c01 * y + c02 * z),
+        scale * (c01 * x + c11 * y + c12 * z),
+        scale * (c02 * x + c12 * y + c22 * z),
+    )
+
+
+@kernel
+def set_bodies(awake, velocities, inverse_mass, inverse_inertia, bodies):
+    """Set the bodies of the solve: awake rocks with their inertia, all others immovable and at rest.
+
+    Args:
+        awake: (m,) rocks.
+        velocities: (n, 6) angular, translational, in W.
+        inverse_mass: (n,) [1/kg].
+        inverse_inertia: (n, 6) in W's axes.
+        bodies: (n + 1, BODY_WIDTH) set.
+    """
+    bodies[:] = 0.0
+    for s in range(len(awake)):
+        i = awake[s]
+        for d in range(6):
+            bodies[i, d] = velocities[i, d]
+            bodies[i, INVERSE_INERTIA + d] = inverse_inertia[i, d]
+        bodies[i, INVERSE_MASS] = inverse_mass[i]
+
+
+@kernel
+def add_gravity(awake, bodies, change):
+    """Add gravity's change of velocity over a step (3,) to the awake rocks."""
+    for s in range(len(awake)):
+        for d in range(3):
+            bodies[awake[s], 3 + d] += change[d]
+
+
+@kernel
+def move(awake, bodies, inverse_inertia_local, time_step, quaternions, positions, velocities):
+    """Advance the awake rocks' poses with their new velocities.
+
+    Free spin keeps the angular momentum: the rotation is taken with the angular velocity at the middle of the
+    step (explicit mid-point), and the new angular velocity follows from the momentum and the new inertia.
+
+    Args:
+        awake: (m,) rocks.
+        bodies: (n + 1, BODY_WIDTH) after the solve.
+        inverse_inertia_local: (n, 6) in the rocks' frames.
+        time_step: [s].
+        quaternions, positions, velocities: (n, 4), (n, 3), (n, 6) changed.
+
+    Returns:
+        False if any of it is not finite.
+    """
+    scratch = np.zeros((1, 6))
+    local = np.zeros((1, 6))
+    sane = True
+    for s in range(len(awake)):
+        i = awake[s]
+        wx, wy, wz = bodies[i, 0], bodies[i, 1], bodies[i, 2]
+        for d in range(3):
+            positions[i, d] += time_step * bodies[i, 3 + d]
+            velocities[i, 3 + d] = bodies[i, 3 + d]
+        for d in range(6):
+            local[0, d] = inverse_inertia_local[i, d]
+            scratch[0, d] = bodies[i, INVERSE_INERTIA + d]
+        qw, qx, qy, qz = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
+        lx, ly, lz = _solve_symmetric(scratch, 0, wx, wy, wz)
+        half = 0.5 * time_step
+        mw, mx, my, mz = turn(qw, qx, qy, qz, half * wx, half * wy, half * wz)
+        rotate_inertia(_make_rotation(mw, mx, my, mz), local, scratch, 0)
+        m = scratch[0]
+        wx = m[0] * lx + m[1] * ly + m[2] * lz
+        wy = m[1] * lx + m[3] * ly + m[4] * lz
+        wz = m[2] * lx + m[4] * ly + m[5] * lz
+        qw, qx, qy, qz = turn(qw, qx, qy, qz, time_step * wx, time_step * wy, time_step * wz)
+        rotate_inertia(_make_rotation(qw, qx, qy, qz), local, scratch, 0)
+        velocities[i, 0] = m[0] * lx + m[1] * ly + m[2] * lz
+        velocities[i, 1] = m[1] * lx + m[3] * ly + m[4] * lz
+        velocities[i, 2] = m[2] * lx + m[4] * ly + m[5] * lz
+        quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3] = qw, qx, qy, qz
+        total = qw + qx + qy + qz
+        for d in range(3):
+            total += positions[i, d] + velocities[i, d] + velocities[i, 3 + d]
+        if not math.isfinite(total):
+            sane = False
+    return sane

@@ -1,0 +1,142 @@
+"""Model reduction: rocks that come to rest, and what wakes them.
+
+A resting rock stays in the force network: the impulses of its contacts are kept, contacts with awake
+neighbours are solved against it as against solid ground. It is woken by a lasting change of its load, or by
+the refinement sensor in front of the bucket.
+"""
+
+from __future__ import annotations
+
+
+import numpy as np
+
+from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, LOST, RESTING
+from drakerock.dynamics.nonsmooth.compiling import kernel
+
+# Columns of a rock's bookkeeping (all stored in the context).
+STATUS = 0
+STILL_TIME = 1
+CHANGED_STEPS = 2
+ANCHOR = 3  # 3..5 where the rock was when its time at rest began
+REFERENCE = 6  # 6..8 sum of its contact impulses when it came to rest [N s]
+BOOK_WIDTH = 9
+
+
+@kernel
+def is_sensed(x, y, z, radius, sensors):
+    """Return whether a sphere meets one of the boxes (k, 18): rotation by rows, position, lower, upper."""
+    for s in range(len(sensors)):
+        box = sensors[s]
+        dx, dy, dz = x - box[9], y - box[10], z - box[11]
+        inside = True
+        for d in range(3):
+            local = box[d] * dx + box[3 + d] * dy + box[6 + d] * dz
+            if local < box[12 + d] - radius or local > box[15 + d] + radius:
+                inside = False
+        if inside:
+            return True
+    return False
+
+
+@kernel
+def wake(
+    book, positions, radius, mass, sums, sensors, load, steps
+):
+    """Wake resting rocks.
+
+    Args:
+        book: (n, BOOK_WIDTH) changed.
+        positions: (n, 3).
+        radius: (n,) bounding spheres [m].
+        mass: (n,) [kg].
+        sums: (n, 3) sum of the contact impulses on each rock [N s].
+        sensors: (k, 18) see `is_sensed`.
+        load: change of the impulse per mass above which a rock wakes [m/s].
+        steps: for how many steps on end.
+
+    Returns:
+        number of rocks woken.
+    """
+    n_woken = 0
+    for i in range(len(book)):
+        if book[i, STATUS] != RESTING:
+            continue
+        change2 = 0.0
+        for d in range(3):
+            change2 += (sums[i, d] - book[i, REFERENCE + d]) ** 2
+        book[i, CHANGED_STEPS] = book[i, CHANGED_STEPS] + 1.0 if change2 > (load * mass[i]) ** 2 else 0.0
+        if book[i, CHANGED_STEPS] >= steps or is_sensed(
+            positions[i, 0], positions[i, 1], positions[i, 2], radius[i], sensors
+        ):
+            wake_rock(book, positions, i)
+            n_woken += 1
+    return n_woken
+
+
+@kernel
+def wake_rock(book, positions, i):
+    """Make one rock awake."""
+    book[i, STATUS] = AWAKE
+    book[i, STILL_TIME] = 0.0
+    book[i, CHANGED_STEPS] = 0.0
+    for d in range(3):
+        book[i, ANCHOR + d] = positions[i, d]
+
+
+@kernel
+def rest(
+    book, positions, velocities, radius, sums, sensors, time_step, displacement, time, speed, lower, upper,
+    may_rest,
+):  # fmt: skip
+    """Let awake rocks come to rest, and take those that left the site out.
+
+    Args:
+        book, positions, radius, sums, sensors: as for `wake`.
+        velocities: (n, 6) changed: zero for rocks that come to rest.
+        time_step: [s].
+        displacement, time, speed: see `RestConfig`.
+        lower, upper: (3,) the site's box; a rock outside is lost [m].
+        may_rest: False: only lost rocks are looked for.
+
+    Returns:
+        number of rocks that came to rest, number lost.
+    """
+    n_rested, n_lost = 0, 0
+    for i in range(len(book)):
+        if book[i, STATUS] != AWAKE:
+            continue
+        moved2 = 0.0
+        fastest = 0.0
+        outside = False
+        for d in range(3):
+            moved2 += (positions[i, d] - book[i, ANCHOR + d]) ** 2
+            fastest = max(fastest, max(abs(velocities[i, d]), abs(velocities[i, 3 + d])))
+            if positions[i, d] < lower[d] or positions[i, d] > upper[d]:
+                outside = True
+        if outside:
+            book[i, STATUS] = LOST
+            for d in range(6):
+                velocities[i, d] = 0.0
+            n_lost += 1
+            continue
+        if not may_rest:
+            continue
+        if moved2 > displacement * displacement:
+            book[i, STILL_TIME] = 0.0
+            for d in range(3):
+                book[i, ANCHOR + d] = positions[i, d]
+        else:
+            book[i, STILL_TIME] += time_step
+        if (
+            book[i, STILL_TIME] >= time
+            and fastest < speed
+            and not is_sensed(positions[i, 0], positions[i, 1], positions[i, 2], radius[i], sensors)
+        ):
+            book[i, STATUS] = RESTING
+            book[i, CHANGED_STEPS] = 0.0
+            for d in range(3):
+                book[i, REFERENCE + d] = sums[i, d]
+            for d in range(6):
+                velocities[i, d] = 0.0
+            n_rested += 1
+    return n_rested, n_lost

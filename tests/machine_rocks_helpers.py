@@ -1,0 +1,88 @@
+"""Diagrams with the machine and nonsmooth rocks for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+
+from drakerock.dynamics.assembly import add_plant, add_site
+from drakerock.dynamics.config import DynamicsConfig
+from drakerock.dynamics.nonsmooth.system import add_nonsmooth_rocks
+from drakerock.machine.config import MachineConfig
+from drakerock.machine.model import add_machine, calc_motor_targets
+from drakerock.machine.placement import set_machine_pose
+from drakerock.pile.config import RocksConfig, SiteConfig
+from drakerock.pile.shapes import load_rock_shapes
+from drakerock.pile.site import make_site
+
+
+class Rates(LeafSystem):
+    """Joint rates of wheels, boom and bucket as a function of time."""
+
+    def __init__(self, plant, machine, rates: Callable[[float], tuple[float, float, float]]):
+        super().__init__()
+        size = len(calc_motor_targets(plant, machine, 0, 0, 0))
+        self.DeclareVectorOutputPort(
+            "desired_state",
+            size,
+            lambda context, output: output.SetFromVector(
+                calc_motor_targets(plant, machine, *rates(context.get_time()))
+            ),
+        )
+
+
+class Scene:
+    """Machine, site and rocks in one Diagram, placed and ready to run."""
+
+    def __init__(self, pile, rates, site=None, dynamics=None, rocks=None, shapes=None, **pose):
+        self.dynamics = dynamics or DynamicsConfig()
+        rocks = rocks or RocksConfig()
+        self.shapes = shapes or load_rock_shapes(rocks.shapes)
+        self.site = make_site(site or SiteConfig())
+        builder = DiagramBuilder()
+        self.plant, self.scene_graph = add_plant(builder, self.dynamics)
+        add_site(self.plant, self.site, self.dynamics)
+        self.machine = add_machine(self.plant, MachineConfig())
+        self.plant.Finalize()
+        self.rocks, view = add_nonsmooth_rocks(
+            builder, self.plant, self.scene_graph, self.machine, self.site, self.shapes, rocks, self.dynamics, pile
+        )
+        source = builder.AddSystem(Rates(self.plant, self.machine, rates))
+        builder.Connect(
+            source.GetOutputPort("desired_state"),
+            self.plant.get_desired_state_input_port(self.machine.instance),
+        )
+        builder.Connect(source.GetOutputPort("desired_state"), view.GetInputPort("desired_state"))
+        self.diagram = builder.Build()
+        self.simulator = Simulator(self.diagram)
+        self.context = self.simulator.get_mutable_context()
+        self.plant_context = self.plant.GetMyMutableContextFromRoot(self.context)
+        set_machine_pose(self.plant, self.plant_context, self.machine, **pose)
+        self.simulator.Initialize()
+
+    def step(self) -> None:
+        self.simulator.AdvanceTo(self.context.get_time() + self.dynamics.time_step)
+
+    def get_bucket_force(self) -> np.ndarray:
+        """(6,) of the last step."""
+        return self.rocks.GetOutputPort("F_B_W").Eval(self.rocks.GetMyContextFromRoot(self.context)).copy()
+
+    def get_summary(self) -> np.ndarray:
+        return self.rocks.GetOutputPort("rock_summary").Eval(self.rocks.GetMyContextFromRoot(self.context)).copy()
+
+    def get_torque(self, joint: str) -> float:
+        index = [
+            self.plant.get_joint_actuator(k).joint().name()
+            for k in self.plant.GetJointActuatorIndices(self.machine.instance)
+        ].index(joint)
+        port = self.plant.get_net_actuation_output_port(self.machine.instance)
+        return float(port.Eval(self.plant_context)[index])
+
+    def get_machine_momentum(self) -> np.ndarray:
+        momentum = self.plant.CalcSpatialMomentumInWorldAboutPoint(
+            self.plant_context, [self.machine.instance], np.zeros(3)
+        )
+        return momentum.translational().copy()
