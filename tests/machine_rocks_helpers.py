@@ -48,7 +48,15 @@ class Scene:
         self.machine = add_machine(self.plant, MachineConfig())
         self.plant.Finalize()
         self.rocks, view = add_nonsmooth_rocks(
-            builder, self.plant, self.scene_graph, self.machine, self.site, self.shapes, rocks, self.dynamics, pile
+            builder,
+            self.plant,
+            self.scene_graph,
+            self.machine,
+            self.site,
+            self.shapes,
+            rocks,
+            self.dynamics,
+            pile,
         )
         source = builder.AddSystem(Rates(self.plant, self.machine, rates))
         builder.Connect(
@@ -71,7 +79,11 @@ class Scene:
         return self.rocks.GetOutputPort("F_B_W").Eval(self.rocks.GetMyContextFromRoot(self.context)).copy()
 
     def get_summary(self) -> np.ndarray:
-        return self.rocks.GetOutputPort("rock_summary").Eval(self.rocks.GetMyContextFromRoot(self.context)).copy()
+        return (
+            self.rocks.GetOutputPort("rock_summary")
+            .Eval(self.rocks.GetMyContextFromRoot(self.context))
+            .copy()
+        )
 
     def get_torque(self, joint: str) -> float:
         index = [

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rock_helpers import make_ball, make_box, make_engine, make_pile, make_plane_site, make_shape, run
 from scipy.spatial.transform import Rotation
 
 from drakerock.dynamics.config import NonsmoothConfig
 from drakerock.dynamics.nonsmooth.engine import MachinePiece, MachineStep
 from drakerock.dynamics.nonsmooth.solver import MACHINE_ROW_WIDTH, MachineArrays
 from drakerock.pile.config import RocksConfig
+from rock_helpers import make_ball, make_box, make_engine, make_pile, make_plane_site, make_shape, run
 
 G = 9.81
 
@@ -35,9 +35,7 @@ def test_block_on_a_slope_around_the_friction_angle(excess_deg, slides):
     pile = make_pile(
         [turn.apply([0, 0, 0.15])], quaternions=[turn.as_quat(scalar_first=True)], velocities=np.zeros((1, 6))
     )
-    engine = make_engine(
-        pile, [make_box(0.8, 0.6, 0.3)], make_plane_site(b, slope), RocksConfig(friction=a)
-    )
+    engine = make_engine(pile, [make_box(0.8, 0.6, 0.3)], make_plane_site(b, slope), RocksConfig(friction=a))
     arrays, _ = run(engine, engine.make_arrays(pile), 1.0)
     travelled = np.linalg.norm(arrays.positions[0] - pile.p_WRs[0])
     expected = 0.5 * G * (np.sin(slope) - mu * np.cos(slope)) if slides else 0.0
@@ -47,9 +45,7 @@ def test_block_on_a_slope_around_the_friction_angle(excess_deg, slides):
 def test_sliding_distance():
     """A block with initial speed v stops after v^2 / (2 mu g)."""
     pile = make_pile([[0, 0, 0.15]], velocities=[[0, 0, 0, 3.0, 0, 0]])
-    engine = make_engine(
-        pile, [make_box(0.8, 0.6, 0.3)], make_plane_site(0.5), RocksConfig(friction=0.5)
-    )
+    engine = make_engine(pile, [make_box(0.8, 0.6, 0.3)], make_plane_site(0.5), RocksConfig(friction=0.5))
     arrays, _ = run(engine, engine.make_arrays(pile), 2.0)
     assert arrays.positions[0, 0] == pytest.approx(9.0 / (2 * 0.5 * G), rel=0.02)
     assert np.abs(arrays.velocities).max() < 1e-3
@@ -98,7 +94,9 @@ def test_impact_against_the_machine_has_its_restitution(restitution):
 def test_rock_on_rock_impact_is_plastic_and_keeps_momentum():
     """Two boxes meet face to face in free flight: they go on together."""
     pile = make_pile(
-        [[0, 0, 20.0], [1.5, 0, 20.0]], velocities=[[0, 0, 0, 2.0, 0, 0], [0, 0, 0, -1.0, 0, 0]], size=[1.0, 0.8]
+        [[0, 0, 20.0], [1.5, 0, 20.0]],
+        velocities=[[0, 0, 0, 2.0, 0, 0], [0, 0, 0, -1.0, 0, 0]],
+        size=[1.0, 0.8],
     )
     engine = make_engine(pile, [make_box(1, 1, 1)], gravity=0.0)
     arrays, _ = run(engine, engine.make_arrays(pile), 1.0)

@@ -75,9 +75,7 @@ class NonsmoothConfig(Config):
         float,
         Field(gt=0, description="a step with more is solved again with more iterations, and flagged"),
     ] = 0.2
-    max_penetration: Annotated[
-        float, Field(gt=0, description="overlaps beyond it are flagged [m]")
-    ] = 0.04
+    max_penetration: Annotated[float, Field(gt=0, description="overlaps beyond it are flagged [m]")] = 0.04
     memory_per_rock: Annotated[
         int, Field(ge=3, le=50, description="loaded contact points that can be kept, per rock")
     ] = 5
@@ -101,7 +99,9 @@ class PlantEngineConfig(Config):
 class DynamicsConfig(Config):
     """Time stepping and contact of the whole Diagram."""
 
-    rocks: Annotated[Literal["plant", "nonsmooth"], Field(description="the engine that moves the rocks")] = "plant"
+    rocks: Annotated[Literal["plant", "nonsmooth"], Field(description="the engine that moves the rocks")] = (
+        "plant"
+    )
     time_step: Annotated[float, Field(gt=1e-4, le=0.05, description="[s]")] = 0.01
     contact_approximation: Annotated[
         Literal["similar", "lagged", "sap"], Field(description="Drake's discrete contact approximation")

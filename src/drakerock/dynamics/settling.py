@@ -16,6 +16,7 @@ from drakerock.config import Config, calc_config_hash
 from drakerock.dynamics.assembly import add_plant, add_site
 from drakerock.dynamics.config import DynamicsConfig
 from drakerock.dynamics.contact_graph import find_loose
+from drakerock.dynamics.nonsmooth.engine import NonsmoothEngine
 from drakerock.dynamics.plant.rocks import add_plant_rocks, add_rock_bodies
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.pile.config import PileConfig, RocksConfig, SiteConfig
@@ -65,31 +66,62 @@ def settle(
     Raises:
         SimulationFailure: the dynamics failed.
     """
-    builder = DiagramBuilder()
-    plant, _ = add_plant(builder, recipe.dynamics)
-    add_site(plant, make_site(recipe.site), recipe.dynamics)
-    geometries = add_rock_bodies(plant, pile, shapes, recipe.rocks, recipe.dynamics)
-    plant.Finalize()
-    rocks = add_plant_rocks(builder, plant, pile, geometries)
-    diagram = builder.Build()
-    simulator = Simulator(diagram)
-    root = simulator.get_mutable_context()
-    rocks.set_pile(root, pile)
+    advance = _make_plant_advance if recipe.dynamics.rocks == "plant" else _make_nonsmooth_advance
+    advance_to = advance(pile, shapes, recipe)
     window, resting, time = recipe.pile.settle_window, False, 0.0
     before = pile
     while time < duration - 1e-9 and not (until_rest and resting):
         time = min(time + window, duration)
         try:
-            simulator.AdvanceTo(time)
+            after = advance_to(time)
         except RuntimeError as error:
             raise SimulationFailure(f"settling the pile failed at {time:.2f} s: {error}") from None
-        after = rocks.get_pile(root)
         moved = np.linalg.norm(after.p_WRs - before.p_WRs, axis=1)
         resting = bool(np.percentile(moved, 99) < recipe.pile.settle_speed * window)
         before = after
         if progress:
             progress(time / duration)
     return before, resting
+
+
+def _make_plant_advance(
+    pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe
+) -> Callable[[float], PileState]:
+    builder = DiagramBuilder()
+    plant, _ = add_plant(builder, recipe.dynamics)
+    add_site(plant, make_site(recipe.site), recipe.dynamics)
+    geometries = add_rock_bodies(plant, pile, shapes, recipe.rocks, recipe.dynamics)
+    plant.Finalize()
+    rocks = add_plant_rocks(builder, plant, pile, geometries)
+    simulator = Simulator(builder.Build())
+    root = simulator.get_mutable_context()
+    rocks.set_pile(root, pile)
+
+    def advance_to(time: float) -> PileState:
+        simulator.AdvanceTo(time)
+        return rocks.get_pile(root)
+
+    return advance_to
+
+
+def _make_nonsmooth_advance(
+    pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe
+) -> Callable[[float], PileState]:
+    engine = NonsmoothEngine(
+        recipe.rocks, shapes, make_site(recipe.site), recipe.dynamics.nonsmooth, recipe.dynamics.time_step,
+        pile.shape, pile.size, pile.fixed,
+    )  # fmt: skip
+    arrays = engine.make_arrays(pile)
+    steps = 0
+
+    def advance_to(time: float) -> PileState:
+        nonlocal arrays, steps
+        while steps < round(time / engine.time_step):
+            arrays, _ = engine.advance(arrays)
+            steps += 1
+        return engine.make_pile(arrays, pile.provenance)
+
+    return advance_to
 
 
 def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState:

@@ -7,8 +7,6 @@ is kept in.
 
 from __future__ import annotations
 
-import numpy as np
-
 from drakerock.dynamics.nonsmooth.compiling import kernel
 
 # Columns of a contact row. All vectors in W; impulses act on body B, and reversed on body A.
@@ -87,9 +85,7 @@ def find_axis(key, axis_keys):
 
 
 @kernel
-def write_memory(
-    n_rocks, status, old, n_old, rows, n_rows, row_key, row_rock, rotations, new
-):
+def write_memory(n_rocks, status, old, n_old, rows, n_rows, row_key, row_rock, rotations, new):
     """Write the memory of the coming step: the loaded points just solved, and all points between rocks at rest.
 
     Args:

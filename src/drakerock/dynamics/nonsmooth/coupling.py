@@ -166,9 +166,9 @@ class MachineView(LeafSystem):
         row_response = np.ascontiguousarray(row_array @ inverse)
         row_values = np.zeros((len(rows), solver.MACHINE_ROW_WIDTH))
         if rows:
-            row_values[:, [solver.TARGET, solver.ROW_COMPLIANCE, solver.LOWER, solver.UPPER, solver.NORMAL_ROW]] = (
-                values
-            )
+            row_values[
+                :, [solver.TARGET, solver.ROW_COMPLIANCE, solver.LOWER, solver.UPPER, solver.NORMAL_ROW]
+            ] = values
             diagonal = np.einsum("rv,rv->r", row_array, row_response)
             row_values[:, solver.ROW_MASS] = 1.0 / (diagonal + row_values[:, solver.ROW_COMPLIANCE])
         X_WB = X_WBs[layout.bucket]
@@ -215,7 +215,9 @@ class MachineView(LeafSystem):
             row = np.zeros(n_v)
             row[motor.velocity_start] = 1.0
             gain = motor.d + h * motor.p
-            target = (motor.d * desired[n + k] + motor.p * (desired[k] - positions[motor.position_start])) / gain
+            target = (
+                motor.d * desired[n + k] + motor.p * (desired[k] - positions[motor.position_start])
+            ) / gain
             rows.append(row)
             values.append([target, 1.0 / (h * gain), -h * motor.effort, h * motor.effort, -1])
         return rows, values
@@ -316,7 +318,8 @@ def _find_stops(plant: MultibodyPlant, machine: Machine) -> Sequence[_Stop]:
     for index in plant.GetJointIndices(machine.instance):
         joint = plant.get_joint(index)
         if joint.num_velocities() == 1 and (
-            np.isfinite(joint.position_lower_limits()).any() or np.isfinite(joint.position_upper_limits()).any()
+            np.isfinite(joint.position_lower_limits()).any()
+            or np.isfinite(joint.position_upper_limits()).any()
         ):
             stops.append(
                 _Stop(

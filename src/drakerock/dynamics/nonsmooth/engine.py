@@ -459,7 +459,13 @@ class NonsmoothEngine:
             0,
         )
         sane = motion.move(
-            awake, self._bodies, self.inverse_inertia_local, dt, new.quaternions, new.positions, new.velocities
+            awake,
+            self._bodies,
+            self.inverse_inertia_local,
+            dt,
+            new.quaternions,
+            new.positions,
+            new.velocities,
         )
         if not sane or not np.isfinite(velocity).all():
             return None, None

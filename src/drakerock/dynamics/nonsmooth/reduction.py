@@ -7,9 +7,6 @@ the refinement sensor in front of the bucket.
 
 from __future__ import annotations
 
-
-import numpy as np
-
 from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, LOST, RESTING
 from drakerock.dynamics.nonsmooth.compiling import kernel
 
@@ -39,9 +36,7 @@ def is_sensed(x, y, z, radius, sensors):
 
 
 @kernel
-def wake(
-    book, positions, radius, mass, sums, sensors, load, steps
-):
+def wake(book, positions, radius, mass, sums, sensors, load, steps):
     """Wake resting rocks.
 
     Args:

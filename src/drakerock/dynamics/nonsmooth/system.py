@@ -94,12 +94,8 @@ class NonsmoothRocks(LeafSystem):
         self._provenance = dict(pile.provenance)
         n = engine.n_rocks
         arrays = engine.make_arrays(pile)
-        self._groups = {
-            name: self.DeclareDiscreteState(values) for name, values in _flatten(arrays).items()
-        }
-        self._machine = self.DeclareAbstractInputPort(
-            "machine_step", Value[object](make_machineless_step())
-        )
+        self._groups = {name: self.DeclareDiscreteState(values) for name, values in _flatten(arrays).items()}
+        self._machine = self.DeclareAbstractInputPort("machine_step", Value[object](make_machineless_step()))
         step = self.DeclareCacheEntry(
             "step",
             ValueProducer(allocate=lambda: Value[object](object()), calc=self._calc_step),
@@ -264,7 +260,5 @@ def add_nonsmooth_rocks(
     builder.Connect(plant.get_state_output_port(), view.GetInputPort("state"))
     builder.Connect(scene_graph.get_query_output_port(), view.GetInputPort("geometry_query"))
     builder.Connect(view.GetOutputPort("machine_step"), system.GetInputPort("machine_step"))
-    builder.Connect(
-        system.GetOutputPort("spatial_forces"), plant.get_applied_spatial_force_input_port()
-    )
+    builder.Connect(system.GetOutputPort("spatial_forces"), plant.get_applied_spatial_force_input_port())
     return system, view

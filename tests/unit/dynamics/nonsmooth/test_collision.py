@@ -160,7 +160,10 @@ def test_results_turn_with_the_frame(seed):
 def test_distance_does_not_depend_on_the_guess(seed):
     rng = np.random.default_rng(seed)
     shapes, r_a, r_b, p = draw_pair(rng, (1.5, 2.5))
-    one, two = calc_distance(shapes, r_a, r_b, p), calc_distance(shapes, r_a, r_b, p, guess=rng.normal(size=3))
+    one, two = (
+        calc_distance(shapes, r_a, r_b, p),
+        calc_distance(shapes, r_a, r_b, p, guess=rng.normal(size=3)),
+    )
     assert one[0] == two[0]
     if one[0] == NEAR:
         np.testing.assert_allclose(one[1:4], two[1:4], atol=1e-4)
@@ -186,7 +189,9 @@ def test_distance_agrees_with_scene_graph(seed):
     ids = []
     for k in range(2):
         frame = scene_graph.RegisterFrame(source, GeometryFrame(f"f{k}"))
-        geometry = GeometryInstance(RigidTransform(), Convex(get_vertices(shapes, k).T.copy(), f"c{k}"), f"g{k}")
+        geometry = GeometryInstance(
+            RigidTransform(), Convex(get_vertices(shapes, k).T.copy(), f"c{k}"), f"g{k}"
+        )
         geometry.set_proximity_properties(ProximityProperties())
         ids.append(scene_graph.RegisterGeometry(source, frame, geometry))
     context = scene_graph.CreateDefaultContext()
@@ -208,7 +213,17 @@ def test_distance_agrees_with_scene_graph(seed):
 
 def calc_manifold(shapes, r_a, r_b, p, max_gap=0.005, scale_b=1.0):
     status, *v, ax, ay, az = calc_core_distance(
-        shapes, 0, 1.0, flat(r_a), 1, scale_b, flat(r_b), *map(float, p), *map(float, p), 1.0, make_gjk_workspace()
+        shapes,
+        0,
+        1.0,
+        flat(r_a),
+        1,
+        scale_b,
+        flat(r_b),
+        *map(float, p),
+        *map(float, p),
+        1.0,
+        make_gjk_workspace(),
     )
     assert status == NEAR
     distance = np.linalg.norm(v)

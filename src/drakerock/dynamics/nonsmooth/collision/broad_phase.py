@@ -211,7 +211,9 @@ def rotate_inertia(r, local, world, i):
 
 
 @kernel
-def calc_piece_boxes(first, piece_body, shape, shapes, X_WBs, V_WBs, sweep, margin, positions, rotations, lower, upper):
+def calc_piece_boxes(
+    first, piece_body, shape, shapes, X_WBs, V_WBs, sweep, margin, positions, rotations, lower, upper
+):
     """Set poses and bounding boxes of the machine's pieces; a box covers the way of every corner over a step.
 
     Args:

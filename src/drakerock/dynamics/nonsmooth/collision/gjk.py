@@ -96,7 +96,9 @@ def _calc_weights(points, n_points, weights):
         nz = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         origin_side = -(nx * ax + ny * ay + nz * az)
         inner_side = (
-            nx * (points[opposite, 0] - ax) + ny * (points[opposite, 1] - ay) + nz * (points[opposite, 2] - az)
+            nx * (points[opposite, 0] - ax)
+            + ny * (points[opposite, 1] - ay)
+            + nz * (points[opposite, 2] - az)
         )
         # A flat tetrahedron has no inside.
         if origin_side * inner_side <= 0.0 or abs(inner_side) < 1e-14:

@@ -52,7 +52,11 @@ def calc_core_penetration(
             )  # fmt: skip
         first, last = shapes.vertex_start[other], shapes.vertex_start[other + 1]
         for face in range(shapes.face_start[shape], shapes.face_start[shape + 1]):
-            fx, fy, fz = shapes.face_normals[face, 0], shapes.face_normals[face, 1], shapes.face_normals[face, 2]
+            fx, fy, fz = (
+                shapes.face_normals[face, 0],
+                shapes.face_normals[face, 1],
+                shapes.face_normals[face, 2],
+            )
             wx, wy, wz = rotate(r, fx, fy, fz)
             if has_history and sign * (wx * hx + wy * hy + wz * hz) < min_cosine:
                 continue
@@ -67,7 +71,11 @@ def calc_core_penetration(
                 cx, cy, cz = get_corner(shapes, deepest, other_scale, other_r)
                 if side == 0:
                     # B's deepest corner, taken back onto A's face
-                    cx, cy, cz = cx + px - separation * wx, cy + py - separation * wy, cz + pz - separation * wz
+                    cx, cy, cz = (
+                        cx + px - separation * wx,
+                        cy + py - separation * wy,
+                        cz + pz - separation * wz,
+                    )
     for edge_a in range(shapes.edge_start[shape_a], shapes.edge_start[shape_a + 1]):
         a0x, a0y, a0z = get_corner(shapes, shapes.edge_vertices[edge_a, 0], scale_a, r_a)
         a1x, a1y, a1z = get_corner(shapes, shapes.edge_vertices[edge_a, 1], scale_a, r_a)
@@ -87,11 +95,17 @@ def calc_core_penetration(
             face = shapes.edge_faces[edge_b, 0]
             # B's normals enter negated: the Gauss map of -B.
             n0x, n0y, n0z = rotate(
-                r_b, -shapes.face_normals[face, 0], -shapes.face_normals[face, 1], -shapes.face_normals[face, 2]
+                r_b,
+                -shapes.face_normals[face, 0],
+                -shapes.face_normals[face, 1],
+                -shapes.face_normals[face, 2],
             )
             face = shapes.edge_faces[edge_b, 1]
             n1x, n1y, n1z = rotate(
-                r_b, -shapes.face_normals[face, 0], -shapes.face_normals[face, 1], -shapes.face_normals[face, 2]
+                r_b,
+                -shapes.face_normals[face, 0],
+                -shapes.face_normals[face, 1],
+                -shapes.face_normals[face, 2],
             )
             # Do the arcs m0 m1 and n0 n1 cross? Edges stand for m0 x m1 and n0 x n1.
             side_n0 = n0x * ux + n0y * uy + n0z * uz
