@@ -10,7 +10,7 @@ from drakerock.loading.config import PlanningConfig, SensingConfig, StrategyConf
 from drakerock.loading.field import PileProfile
 from drakerock.loading.plan import DigPlan, NoPlan
 from drakerock.loading.planning import (
-    calc_ramp,
+    calc_halt,
     calc_swept_volume,
     choose_entry_slice,
     make_dig_plan,
@@ -187,7 +187,7 @@ def test_swept_volume_counts_cells_under_the_width():
 @given(ramp=st.floats(0.05, 0.5), floor=st.floats(0.01, 0.5))
 def test_ramp_stays_between_floor_and_one(ramp, floor):
     u = np.linspace(0, 1, 101)
-    share = calc_ramp(u, ramp, floor, up=True, down=True)
-    assert share.min() == pytest.approx(floor)
-    assert share.max() <= 1.0
-    assert share[50] == pytest.approx(1.0, abs=1e-6)
+    share = calc_halt(u, ramp, floor)
+    assert share[-1] == pytest.approx(floor)
+    assert np.all(np.diff(share) <= 1e-15)
+    assert np.all(share[u <= 1 - ramp] == pytest.approx(1.0))
