@@ -70,10 +70,20 @@ class Confirmation:
 
         try:
             X = np.array([[row[name] for name in problem.variable_names] for row in rows], dtype=float)
-            parts = [read(s) for s in ("predicted", "predicted_std", "simulated", "simulated_se")]
-            return cls(problem, X, *parts, tuple(row["failure"] for row in rows))
+            failure = tuple(str(row["failure"]) for row in rows)
+            return cls(
+                problem,
+                X,
+                read("predicted"),
+                read("predicted_std"),
+                read("simulated"),
+                read("simulated_se"),
+                failure,
+            )
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"confirmation: not the rows of a confirmation of this problem: {error}") from None
+            raise InputError(
+                f"confirmation: not the rows of a confirmation of this problem: {error}"
+            ) from None
 
 
 def confirm_points(surrogate: Surrogate, X: Array, evaluate: Evaluate) -> Confirmation:

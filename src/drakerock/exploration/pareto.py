@@ -54,7 +54,9 @@ def parse_bound(text: str, problem: Problem) -> Bound:
     except ValueError:
         match = None
     if match is None:
-        raise InputError(f"bound '{text}': expected objective<=number or objective>=number, such as debris<=500")
+        raise InputError(
+            f"bound '{text}': expected objective<=number or objective>=number, such as debris<=500"
+        )
     problem.get_objective(match[1])
     return Bound(objective=match[1], relation="<=" if match[2] == "<=" else ">=", value=value)
 
@@ -254,7 +256,7 @@ class _History(Callback):  # type: ignore[misc]
 
 
 def _calc_hypervolume(F: Array, reference: Array) -> float:
-    inside = F[np.all(F < reference, axis=1)] if len(F) else F
+    inside = F[(reference - F > 0.0).all(axis=1)] if len(F) else F
     return float(HV(ref_point=reference)(inside)) if len(inside) else 0.0
 
 

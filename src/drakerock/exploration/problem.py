@@ -34,7 +34,9 @@ class Variable(Config):
     @model_validator(mode="after")
     def _check_range(self) -> Self:
         if not self.low < self.high:
-            raise ValueError(f"variable '{self.name}': low must be below high, got {self.low} and {self.high}")
+            raise ValueError(
+                f"variable '{self.name}': low must be below high, got {self.low} and {self.high}"
+            )
         return self
 
     @property
@@ -69,8 +71,12 @@ class Problem(Config):
         default=(
             Variable(name="alpha", symbol="α", low=0.2, high=2.0, meaning="bucket fill ratio aimed at"),
             Variable(name="beta", symbol="β", low=0.0, high=1.0, meaning="dig height: 0 deep, 1 shallow"),
-            Variable(name="gamma", symbol="γ", low=0.0, high=1.0, meaning="entry point: 0 rear-most, 1 front-most"),
-            Variable(name="kappa", symbol="κ", low=0.0, high=1.0, meaning="share of the curl done while lifting"),
+            Variable(
+                name="gamma", symbol="γ", low=0.0, high=1.0, meaning="entry point: 0 rear-most, 1 front-most"
+            ),
+            Variable(
+                name="kappa", symbol="κ", low=0.0, high=1.0, meaning="share of the curl done while lifting"
+            ),
         ),
         min_length=1,
     )
@@ -135,12 +141,13 @@ class Problem(Config):
     def make_point(self, values: Mapping[str, float]) -> Array:
         """Return the point (d,) from values by variable name; all must be given and inside their ranges."""
         if set(values) != set(self.variable_names):
-            raise InputError(
-                f"a point needs exactly {', '.join(self.variable_names)}; got {', '.join(values) or 'nothing'}"
-            )
+            got = ", ".join(values) or "nothing"
+            raise InputError(f"a point needs exactly {', '.join(self.variable_names)}; got {got}")
         for v in self.variables:
             if not v.low <= values[v.name] <= v.high:
-                raise InputError(f"{v.name} = {values[v.name]:g} is outside its range [{v.low:g}, {v.high:g}]")
+                raise InputError(
+                    f"{v.name} = {values[v.name]:g} is outside its range [{v.low:g}, {v.high:g}]"
+                )
         return np.array([float(values[name]) for name in self.variable_names])
 
 

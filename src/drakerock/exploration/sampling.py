@@ -47,7 +47,9 @@ class SamplingConfig(Config):
     n_validation: int = Field(default=40, ge=0, description="random points used for validation only")
     batch_size: int = Field(default=8, ge=1, description="points per sequential step")
     methods: tuple[MethodName, ...] = Field(
-        default=("lola_voronoi", "error"), min_length=1, description="sequential methods, taken in turn per batch"
+        default=("lola_voronoi", "error"),
+        min_length=1,
+        description="sequential methods, taken in turn per batch",
     )
     n_candidates: int = Field(default=2048, ge=64, description="candidate points of the sequential methods")
     surrogate: SurrogateConfig = SurrogateConfig()
@@ -173,8 +175,8 @@ class SpaceFillingSampler(Sampler):
 class LolaVoronoiSampler(Sampler):
     """LOLA-Voronoi (Crombecq et al. 2011; OpenTURNS): local non-linearity times Voronoi volume.
 
-    The score is the mean over the objectives, each divided by its range. Points without a response are left
-    to the Voronoi part alone: they are given the surrogate-free mean of the responses near them.
+    The score is the mean over the objectives, each divided by its range. A point without a response takes the
+    responses of its nearest neighbour that has some: its place counts, and no non-linearity is made up.
     """
 
     def _propose(self, U: Array, Y: Array, noise: Array, n: int) -> Array:
@@ -196,9 +198,9 @@ class LolaVoronoiSampler(Sampler):
 class ErrorSampler(Sampler):
     """Where the surrogate is wrong: around the sample points with the largest leave-one-out error.
 
-    The squared leave-one-out error of each point, in ranges of the objective, averaged over the objectives and
-    less the point's own noise variance, is given to the point's Voronoi cell (CV-Voronoi, Xu et al. 2014); the
-    new point is the candidate in the worst cell farthest from all points, one per cell and batch.
+    The squared leave-one-out error of each point, less the point's own noise variance, in ranges of the
+    objective and summed over the objectives, is given to the point's Voronoi cell (CV-Voronoi, Xu et al.
+    2014); the new point is the candidate in the worst cell farthest from all points, one per cell and batch.
     """
 
     def _propose(self, U: Array, Y: Array, noise: Array, n: int) -> Array:
@@ -246,7 +248,8 @@ class VarianceSampler(Sampler):
         taken: list[int] = []
         for _ in range(n):
             score = sum(
-                (update.variance / r**2 for update, r in zip(updates, ranges, strict=True)), np.zeros(len(candidates))
+                (update.variance / r**2 for update, r in zip(updates, ranges, strict=True)),
+                np.zeros(len(candidates)),
             )
             score[taken] = -np.inf
             best = int(np.argmax(score))
@@ -319,7 +322,9 @@ class HypervolumeSampler(Sampler):
         reference = (Y[good] * signs / ranges).max(axis=0) + 0.1
         directions = _make_directions(k, self.n_directions, rng)
         normal = qmc.MultivariateNormalQMC(np.zeros(k), rng=rng).random(self.n_draws)
-        lengths = np.array([_scalarize(reference - f - s * z, directions) for z in normal])  # (draws, cand., dir.)
+        lengths = np.array(
+            [_scalarize(reference - f - s * z, directions) for z in normal]
+        )  # (draws, cand., dir.)
         reached = _scalarize(reference - front, directions).max(axis=0)
         taken: list[int] = []
         for _ in range(n):
@@ -354,7 +359,7 @@ class FrontSampler(Sampler):
 
 
 class AlternatingSampler(Sampler):
-    """The methods of the configuration in turn, one per batch; the turn follows from the number of points told."""
+    """The methods of the configuration in turn, one per batch; how many points are told says whose turn."""
 
     def _propose(self, U: Array, Y: Array, noise: Array, n: int) -> Array:
         methods = self.config.methods
@@ -384,17 +389,15 @@ def _make_corners(d: int, n: int, rng: np.random.Generator) -> Array:
     if 2**d <= n:
         return np.array([[1.0 if i >> j & 1 else -1.0 for j in range(d)] for i in range(2**d)])
     # Too many corners to list: spread a subset of random ones, the first opposite pair given.
-    pool = np.unique(rng.choice([-1.0, 1.0], size=(64 * n, d)), axis=0)
+    pool = np.unique(np.sign(rng.uniform(-1.0, 1.0, (64 * n, d))), axis=0)
     first = -np.ones((1, d))
     return np.vstack([first, _spread(pool, first, n - 1)])
 
 
 def _spread(candidates: Array, occupied: Array, n: int) -> Array:
     """Return n of the candidates, each in turn the one farthest from all points before it."""
-    if len(occupied):
-        distance = cdist(candidates, occupied).min(axis=1)
-    else:
-        distance = -np.sum(candidates**2, axis=1)  # nothing there yet: begin in the middle
+    # With nothing there yet, begin in the middle.
+    distance = cdist(candidates, occupied).min(axis=1) if len(occupied) else -np.sum(candidates**2, axis=1)
     taken: list[int] = []
     for _ in range(min(n, len(candidates))):
         i = int(np.argmax(distance))
@@ -429,7 +432,7 @@ def _make_uniform(d: int) -> ot.Distribution:
 
 @contextmanager
 def _seed_openturns(seed: int) -> Iterator[None]:
-    """Seed OpenTURNS and set the mean of the scores; its generator and settings are global, so put them back."""
+    """Seed OpenTURNS and have it average scores; its generator and settings are global, so put them back."""
     state = ot.RandomGenerator.GetState()
     key = "LOLAVoronoi-NonLinearityAggregationMethod"
     method = ot.ResourceMap.Get(key)

@@ -25,7 +25,9 @@ from drakerock.randomness import derive_seed
 class SensitivityConfig(Config):
     """Settings of the Sobol' indices."""
 
-    n_base: int = Field(default=1024, ge=64, description="base samples, a power of two; n_base (d + 2) evaluations")
+    n_base: int = Field(
+        default=1024, ge=64, description="base samples, a power of two; n_base (d + 2) evaluations"
+    )
     confidence: float = Field(default=0.95, gt=0.0, lt=1.0, description="probability of the intervals")
 
 

@@ -75,7 +75,8 @@ def parse_weights(text: str, problem: Problem) -> dict[str, float]:
             sep = ""
         if not sep:
             raise InputError(
-                f"weights '{text}': expected objective=number,..., such as production=0.6,damage=0.2,debris=0.2"
+                f"weights '{text}': expected objective=number,..., "
+                "such as production=0.6,damage=0.2,debris=0.2"
             )
     return _check_weights(weights, problem)
 
@@ -88,10 +89,10 @@ def choose_strategy(
     Args:
         front: the Pareto front.
         weights: weight of each objective by name, left-out ones zero, any positive scale. The chosen point
-            minimises the weighted Chebyshev distance max_j w_j r_j + 1e-3 sum_j w_j r_j, with r_j the regret of
-            objective j: 0 at its best, 1 at its worst value on the front. This reaches every point of the
-            front, also in its hollows, and more weight never makes an objective worse. None: the knee,
-            the point with the least sum of regrets (farthest in front of the plane through the single-objective
+            minimises the weighted Chebyshev distance max_j w_j r_j + 1e-3 sum_j w_j r_j, with r_j the regret
+            of objective j: 0 at its best, 1 at its worst value on the front. This reaches every point of the
+            front, also in its hollows, and more weight never makes an objective worse. None: the knee, the
+            point with the least sum of regrets (farthest in front of the plane through the single-objective
             optima, Das 1999).
         bounds: limits that the chosen point must keep.
 
@@ -122,7 +123,13 @@ def choose_strategy(
     i = int(np.argmin(np.where(inside, cost, np.inf)))
     p_optimal = front.uncertainty.p_optimal[i] if front.uncertainty else float("nan")
     return Strategy(
-        problem, front.X[i], front.Y[i], front.std[i], i, f"{name}{f', within {wanted}' if wanted else ''}", p_optimal
+        problem,
+        front.X[i],
+        front.Y[i],
+        front.std[i],
+        i,
+        f"{name}{f', within {wanted}' if wanted else ''}",
+        p_optimal,
     )
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,7 +57,7 @@ class PowerExponential(StationaryKernelMixin, NormalizedKernelMixin, Kernel):
     def __init__(
         self, weights: ArrayLike, p: ArrayLike = 2.0, weights_bounds: tuple[float, float] | str = THETA_BOUNDS
     ) -> None:
-        # scikit-learn calls the vector of all log-hyperparameters `theta`, hence `weights` for the method's theta.
+        # scikit-learn calls all log-hyperparameters `theta`; the method's theta is `weights` here.
         self.weights = weights
         self.p = p
         self.weights_bounds = weights_bounds
@@ -107,7 +107,8 @@ class Kriging(RegressorMixin, BaseEstimator):
         p: exponent(s) in (0, 2], one for all inputs or (d,).
         theta: (d,) imposed weights; None: maximum likelihood.
         lam: imposed regularisation lambda; None: maximum likelihood.
-        trend: imposed constant trend, in the unit of y; None: the mean of y.
+        trend: "mean": the mean of y, the method's centring; "likelihood": the constant of greatest likelihood
+            (generalised least squares, ordinary Kriging); a number: imposed, in the unit of y.
         n_starts: starting points screened by their likelihood; the best quarter of them is optimised.
         random_state: seed of the starting points.
 
@@ -124,7 +125,7 @@ class Kriging(RegressorMixin, BaseEstimator):
         p: ArrayLike = 2.0,
         theta: ArrayLike | None = None,
         lam: float | None = None,
-        trend: float | None = None,
+        trend: float | Literal["mean", "likelihood"] = "mean",
         n_starts: int = 16,
         random_state: int = 0,
     ) -> None:
@@ -145,38 +146,38 @@ class Kriging(RegressorMixin, BaseEstimator):
             noise: (n,) known standard errors of y, in its unit; None: unknown, all noise goes into lambda.
 
         Raises:
-            ValueError: NaN or infinite values, fewer than two points, shapes that do not fit, p outside (0, 2].
+            ValueError: NaN or infinite values, fewer than two points, wrong shapes, p outside (0, 2].
         """
-        X, y = validate_data(self, X, y, dtype=float, ensure_min_samples=2, y_numeric=True)
-        y = np.asarray(y, dtype=float)
-        n, d = X.shape
+        checked = validate_data(self, X, y, dtype=float, ensure_min_samples=2, y_numeric=True)
+        points, y = np.asarray(checked[0], dtype=float), np.asarray(checked[1], dtype=float)
+        n, d = points.shape
         powers = np.asarray(self.p, dtype=float)
         if np.any(powers <= 0.0) or np.any(powers > 2.0):
-            raise ValueError(f"p must be in (0, 2], got {self.p}")
-        self.lower_, self.upper_ = self._find_ranges(X)
-        self.U_train_, self.y_train_ = self._scale(X), y
-        self.trend_ = float(y.mean() if self.trend is None else self.trend)
-        scale = float(np.sqrt(np.mean((y - self.trend_) ** 2)))
+            raise ValueError(f"p must be in (0, 2], got {self.p!r}")
+        self.lower_, self.upper_ = self._find_ranges(points)
+        self.U_train_, self.y_train_ = self._scale(points), y
+        self.trend_ = float(y.mean()) if isinstance(self.trend, str) else float(self.trend)
+        scale = float(y.std()) or abs(float(y[0]) - self.trend_)
         self.noise_ = np.zeros(n) if noise is None else np.asarray(noise, dtype=float)
         if self.noise_.shape != (n,) or not np.all(self.noise_ >= 0.0):
             raise ValueError(f"noise must be {n} standard errors >= 0")
-        self.constant_ = scale <= 1e-12 * max(abs(self.trend_), 1e-300)
+        self.constant_ = scale <= 1e-12 * float(np.abs(y).max())
         if self.constant_:
             self.theta_ = np.full(d, THETA_BOUNDS[0]) if self.theta is None else np.asarray(self.theta, float)
             self.lam_, self.sigma2_, self.log_likelihood_ = float(self.lam or 0.0), 0.0, float("nan")
             self.weights_ = np.zeros(n)
             return self
 
-        gp = GaussianProcessRegressor(
-            self._make_kernel(d),
-            # The jitter keeps duplicate points without noise positive definite when lambda is imposed as 0.
-            alpha=(self.noise_ / scale) ** 2 + 1e-13,
-            optimizer=self._make_optimizer(),
-        )
-        with warnings.catch_warnings():
-            # A theta or lambda at its bound is an answer (inactive input, no noise), not a failure to converge.
-            warnings.simplefilter("ignore", ConvergenceWarning)
-            gp.fit(self.U_train_, (y - self.trend_) / scale)
+        gp = self._fit_process(self._make_kernel(d), self._search, scale)
+        if self.trend == "likelihood":
+            # Ascent by turns, the trend for given theta and lambda and back, to the joint maximum.
+            for _ in range(50):
+                ones = cho_solve((gp.L_, True), np.ones(n))
+                step = float(ones @ (y - self.trend_) / ones.sum())
+                self.trend_ += step
+                gp = self._fit_process(gp.kernel_, _climb, scale)
+                if abs(step) <= 1e-4 * scale:
+                    break
         kernel = gp.kernel_.get_params()
         self.theta_ = np.atleast_1d(np.asarray(kernel["k2__k1__weights"], dtype=float))
         self.lam_ = float(kernel["k2__k2__noise_level"])
@@ -234,6 +235,18 @@ class Kriging(RegressorMixin, BaseEstimator):
         diagonal = np.sum(inverse_root**2, axis=0)
         return self.y_train_ - self.weights_ / diagonal, np.sqrt(self.sigma2_ / diagonal)
 
+    def _fit_process(self, kernel: Kernel, optimizer: Any, scale: float) -> Any:
+        gp = GaussianProcessRegressor(
+            kernel,
+            # The jitter keeps duplicate points without noise positive definite when lambda is imposed as 0.
+            alpha=(self.noise_ / scale) ** 2 + 1e-13,
+            optimizer=optimizer,
+        )
+        with warnings.catch_warnings():
+            # A theta or lambda at its bound is an answer (inactive input, no noise), no failure to converge.
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            return gp.fit(self.U_train_, (self.y_train_ - self.trend_) / scale)
+
     def _find_ranges(self, X: Array) -> tuple[Array, Array]:
         if self.bounds is None:
             lower, upper = X.min(axis=0), X.max(axis=0)
@@ -253,27 +266,29 @@ class Kriging(RegressorMixin, BaseEstimator):
         correlation = PowerExponential(theta, self.p, THETA_BOUNDS if self.theta is None else "fixed")
         # The logarithm of an imposed lambda of zero does not exist; 1e-300 is zero in the sum.
         white = WhiteKernel(
-            1e-3 if self.lam is None else max(self.lam, 1e-300), LAMBDA_BOUNDS if self.lam is None else "fixed"
+            1e-3 if self.lam is None else max(self.lam, 1e-300),
+            LAMBDA_BOUNDS if self.lam is None else "fixed",
         )
         return ConstantKernel(1.0, _SIGMA2_BOUNDS) * (correlation + white)
 
-    def _make_optimizer(self) -> Callable[..., tuple[Array, float]]:
-        def optimize(objective: Callable[..., Any], start: Array, bounds: Array) -> tuple[Array, float]:
-            rng = np.random.default_rng(self.random_state)
-            sobol = qmc.Sobol(len(start), rng=rng).random(max(self.n_starts, 1))
-            # sigma^2 near the variance of y and lambda well below 1 are where optima lie.
-            inner = np.log([(0.3, 30.0)] + [(1e-2, 10.0)] * (len(start) - 1))
-            inner = np.clip(inner, bounds[:, :1], bounds[:, 1:])
-            if self.lam is None:
-                inner[-1] = np.log([1e-6, 0.3])
-            starts = np.vstack([start, inner[:, 0] + sobol * (inner[:, 1] - inner[:, 0])])
-            values = np.array([objective(s, eval_gradient=False) for s in starts])
-            best = np.argsort(values, kind="stable")[: max(1, self.n_starts // 4)]
-            results = [minimize(objective, starts[i], jac=True, bounds=bounds, method="L-BFGS-B") for i in best]
-            winner = min(results, key=lambda result: result.fun)
-            return winner.x, float(winner.fun)
+    def _search(self, objective: Callable[..., Any], start: Array, bounds: Array) -> tuple[Array, float]:
+        """Maximise the likelihood from the best of several starts; scikit-learn's optimizer interface."""
+        rng = np.random.default_rng(self.random_state)
+        sobol = qmc.Sobol(len(start), rng=rng).random_base2(int(np.ceil(np.log2(self.n_starts))))
+        # sigma^2 near the variance of y and lambda well below 1 are where optima lie.
+        inner = np.log([(0.3, 30.0)] + [(1e-2, 10.0)] * (len(start) - 1))
+        if self.lam is None:
+            inner[-1] = np.log([1e-6, 0.3])
+        starts = np.vstack([start, inner[:, 0] + sobol * (inner[:, 1] - inner[:, 0])])
+        values = np.array([objective(s, eval_gradient=False) for s in starts])
+        best = np.argsort(values, kind="stable")[: max(1, self.n_starts // 4)]
+        results = [_climb(objective, starts[i], bounds) for i in best]
+        return min(results, key=lambda result: result[1])
 
-        return optimize
+
+def _climb(objective: Callable[..., Any], start: Array, bounds: Array) -> tuple[Array, float]:
+    result = minimize(objective, start, jac=True, bounds=bounds, method="L-BFGS-B")
+    return result.x, float(result.fun)
 
 
 class SurrogateConfig(Config):
@@ -281,6 +296,10 @@ class SurrogateConfig(Config):
 
     p: float | tuple[float, ...] = Field(default=2.0, description="exponent of the correlation, in (0, 2]")
     n_starts: int = Field(default=16, ge=1, description="starting points of the maximum likelihood")
+    trend: Literal["mean", "likelihood"] = Field(
+        default="mean",
+        description="constant trend: the mean of the responses, or that of greatest likelihood",
+    )
     use_noise: bool = Field(default=True, description="use the points' standard errors where they are known")
 
 
@@ -334,12 +353,13 @@ class Surrogate(MultiOutputMixin, RegressorMixin, BaseEstimator):
             distinct = len(np.unique(X[good], axis=0))
             if distinct < d + 2:
                 raise InputError(
-                    f"surrogate: objective '{objective.name}' has {distinct} distinct points with a response; "
+                    f"surrogate: '{objective.name}' has a response at {distinct} distinct points; "
                     f"{d} variables need at least {d + 2}"
                 )
             model = Kriging(
                 bounds=np.stack([problem.low, problem.high]),
                 p=config.p,
+                trend=config.trend,
                 n_starts=config.n_starts,
                 random_state=derive_seed(self.seed, "surrogate", objective.name),
             )

@@ -92,7 +92,9 @@ class ResponseTable:
             object.__setattr__(self, name, value)
         for name in ("point", "role", "n_loadings", "n_failed", "failure", "replay"):
             if len(getattr(self, name)) != n:
-                raise InputError(f"response table: {name} must have {n} entries, got {len(getattr(self, name))}")
+                raise InputError(
+                    f"response table: {name} must have {n} entries, got {len(getattr(self, name))}"
+                )
         self._check()
 
     def _check(self) -> None:
@@ -111,7 +113,9 @@ class ResponseTable:
                     f"response table, point '{self.point[i]}': role '{role}' is not one of {', '.join(ROLES)}"
                 )
         if np.isinf(self.Y).any() or np.nanmin(self.noise, initial=0.0) < 0.0:
-            raise InputError("response table: responses must be finite or empty, standard errors >= 0 or empty")
+            raise InputError(
+                "response table: responses must be finite or empty, standard errors >= 0 or empty"
+            )
 
     def __len__(self) -> int:
         return len(self.X)
@@ -126,7 +130,11 @@ class ResponseTable:
         for name in ("point", "role", "n_loadings", "n_failed", "failure", "replay"):
             changes[name] = tuple(getattr(self, name)[i] for i in rows)
         if not rows:  # an empty tuple would be read as "not given"; there is nothing to give either way
-            changes = {"X": np.empty((0, self.X.shape[1])), "Y": np.empty((0, self.Y.shape[1])), "noise": None}
+            changes = {
+                "X": np.empty((0, self.X.shape[1])),
+                "Y": np.empty((0, self.Y.shape[1])),
+                "noise": None,
+            }
         return replace(self, **changes)
 
     def to_arrow(self) -> pa.Table:
@@ -137,7 +145,9 @@ class ResponseTable:
         for j, name in enumerate(self.problem.objective_names):
             columns[name] = pa.array(self.Y[:, j], from_pandas=True)
             columns[f"{name}_se"] = pa.array(self.noise[:, j], from_pandas=True)
-        columns |= {name: list(getattr(self, name)) for name in ("n_loadings", "n_failed", "failure", "replay")}
+        columns |= {
+            name: list(getattr(self, name)) for name in ("n_loadings", "n_failed", "failure", "replay")
+        }
         return pa.table(columns)
 
     def save(self, path: str | Path) -> Path:
@@ -182,7 +192,8 @@ def _find_table(path: Path) -> Path:
             if (path / name).exists():
                 return path / name
         raise InputError(
-            f"{path}: no responses.parquet or responses.csv in this folder; make one with `drakerock study export`"
+            f"{path}: no responses.parquet or responses.csv in this folder; "
+            "make one with `drakerock study export`"
         )
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
@@ -256,15 +267,26 @@ def _from_arrow(
     failure, replay = texts("failure", [""] * n), texts("replay", [""] * n)
     try:
         if "loading" in names:
-            return average_loadings(problem, point, numbers("loading"), X, Y, role, failure, replay, provenance)
+            return average_loadings(
+                problem, point, numbers("loading"), X, Y, role, failure, replay, provenance
+            )
         unknown = np.full(n, np.nan)
         noise = np.column_stack(
             [numbers(f"{name}_se") if f"{name}_se" in names else unknown for name in problem.objective_names]
         )
         return cls(
-            problem, X, Y, noise, point, role, counts("n_loadings", 1), counts("n_failed", 0), failure, replay,
+            problem,
+            X,
+            Y,
+            noise,
+            point,
+            role,
+            counts("n_loadings", 1),
+            counts("n_failed", 0),
+            failure,
+            replay,
             provenance,
-        )  # fmt: skip
+        )
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
 

@@ -44,7 +44,9 @@ class Comparison:
         if len(self.simulated) == 0:
             return float("nan")
         half = norm.ppf(0.5 + level / 2.0) * self.std
-        return float(np.mean(np.abs(self.predicted - self.simulated) <= half + 1e-12 * np.abs(self.simulated)))
+        return float(
+            np.mean(np.abs(self.predicted - self.simulated) <= half + 1e-12 * np.abs(self.simulated))
+        )
 
 
 @dataclass(frozen=True)
