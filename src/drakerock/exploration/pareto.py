@@ -211,7 +211,11 @@ def select_spread(front: ParetoFront, n: int, first: Sequence[int] = ()) -> Indi
     farthest, in normalised objectives, from those taken.
     """
     regret = front.calc_regret()
-    chosen = list(dict.fromkeys([*map(int, first), *map(int, regret.argmin(axis=0))]))[:n]
+    chosen = list(dict.fromkeys(map(int, first)))[:n]
+    for best in map(int, regret.argmin(axis=0)):
+        # One point may be the best of two objectives, or next to it.
+        if len(chosen) < n and (not chosen or cdist(regret[[best]], regret[chosen]).min() > 0.05):
+            chosen.append(best)
     while len(chosen) < min(n, len(front)):
         distance = cdist(regret, regret[chosen]).min(axis=1)
         chosen.append(int(np.argmax(distance)))

@@ -129,12 +129,6 @@ class ResponseTable:
         changes: dict[str, Any] = {name: getattr(self, name)[list(rows)] for name in ("X", "Y", "noise")}
         for name in ("point", "role", "n_loadings", "n_failed", "failure", "replay"):
             changes[name] = tuple(getattr(self, name)[i] for i in rows)
-        if not rows:  # an empty tuple would be read as "not given"; there is nothing to give either way
-            changes = {
-                "X": np.empty((0, self.X.shape[1])),
-                "Y": np.empty((0, self.Y.shape[1])),
-                "noise": None,
-            }
         return replace(self, **changes)
 
     def to_arrow(self) -> pa.Table:
