@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import norm
+from sklearn.base import clone
 
 from drakerock.errors import InputError
 from drakerock.exploration.problem import Array
@@ -71,6 +72,36 @@ class Accuracy:
     validation_nrmse: float
     noise_floor: float
     coverage: tuple[float, ...]
+
+
+def calc_learning_curve(surrogate: Surrogate, table: ResponseTable, n_sizes: int = 8) -> tuple[Array, Array]:
+    """Return how the validation NRMSE falls with the number of sample points, taken in the table's order.
+
+    Each size is refitted with the theta, lambda and trend of the full fit, so that the curve shows what more
+    points bring and not what more likelihood searches bring.
+
+    Returns:
+        Sizes (s,) and NRMSE (s, k); no sizes without validation points or with too few samples.
+    """
+    samples, others = table.select("sample"), table.select("validation")
+    k = len(table.problem.objectives)
+    first = max(2 * len(table.problem.variables) + 2, len(samples) // n_sizes)
+    complete = np.isfinite(others.Y).all(axis=1)
+    if not complete.any() or first >= len(samples):
+        return np.empty(0, dtype=int), np.empty((0, k))
+    sizes = np.unique(np.linspace(first, len(samples), n_sizes).astype(int))
+    nrmse = np.full((len(sizes), k), np.nan)
+    for j, model in enumerate(surrogate.models_):
+        good = np.isfinite(samples.Y[:, j])
+        for i, size in enumerate(sizes):
+            rows = np.flatnonzero(good[:size])
+            if model.constant_ or len(rows) < 2:
+                continue
+            part = clone(model).set_params(theta=model.theta_, lam=model.lam_, trend=model.trend_)
+            part.fit(samples.X[rows], samples.Y[rows, j], model.noise_[: len(rows)])
+            error = part.predict(others.X[complete]) - others.Y[complete, j]
+            nrmse[i, j] = np.sqrt(np.mean(error**2)) / calc_ranges(samples.Y[good, j : j + 1])[0]
+    return sizes, nrmse
 
 
 def validate(surrogate: Surrogate, table: ResponseTable) -> tuple[Accuracy, ...]:
