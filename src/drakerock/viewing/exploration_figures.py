@@ -127,7 +127,8 @@ def draw_front(
         )
     if front.uncertainty:
         cloud = np.vstack(front.uncertainty.fronts[:20])
-        ax.scatter(cloud[:, x], cloud[:, y], s=3, lw=0, color=_MIDDLE, alpha=0.12, label="fronts of draws")
+        ax.scatter(cloud[:, x], cloud[:, y], s=3, lw=0, color=_MIDDLE, alpha=0.12)
+        ax.scatter([], [], s=12, lw=0, color=_MIDDLE, label="fronts of draws")  # visible in the legend
     colour: dict[str, Any] = (
         {"c": front.Y[:, shade], "cmap": COLORMAP} if shade is not None else {"color": _DARK}
     )
@@ -156,11 +157,10 @@ def draw_front(
 def draw_coverage(ax: Axes, table: ResponseTable, pair: tuple[int, int]) -> Axes:
     """Draw sample points (dots) and validation points (crosses) in two variables."""
     i, j = pair
-    for role, style in {"sample": {"marker": "o", "s": 10}, "validation": {"marker": "x", "s": 18}}.items():
+    for role, marker, size in (("sample", "o", 10), ("validation", "x", 18)):
         X = table.select(role).X
-        ax.scatter(
-            X[:, i], X[:, j], color=_DARK if role == "sample" else _ACCENT, lw=0.9, label=role, **style
-        )
+        colour = _DARK if role == "sample" else _ACCENT
+        ax.scatter(X[:, i], X[:, j], s=size, marker=marker, color=colour, lw=0.9, label=role)
     a, b = table.problem.variables[i], table.problem.variables[j]
     ax.set(xlabel=a.label, ylabel=b.label)
     ax.set_xlim(a.low - 0.04 * _span(a), a.high + 0.04 * _span(a))
@@ -178,9 +178,8 @@ def draw_predicted(ax: Axes, accuracy: Accuracy, label: str) -> Axes:
         loo.simulated, loo.predicted, s=9, color=_LIGHT, edgecolors=_MIDDLE, lw=0.4, label="leave-one-out"
     )
     if len(val.simulated):
-        ax.errorbar(
-            val.simulated, val.predicted, yerr=val.std, fmt="x", ms=4, lw=0.7, color=_ACCENT, label="validation"
-        )  # fmt: skip
+        bars: dict[str, Any] = {"fmt": "x", "ms": 4, "lw": 0.7, "color": _ACCENT}
+        ax.errorbar(val.simulated, val.predicted, yerr=val.std, label="validation", **bars)
     shown = [f"leave-one-out NRMSE {100 * accuracy.loo_nrmse:.1f} %"]
     if np.isfinite(accuracy.validation_nrmse):
         shown.append(f"validation NRMSE {100 * accuracy.validation_nrmse:.1f} %")
@@ -223,7 +222,7 @@ def draw_sensitivity(ax: Axes, sensitivity: Sensitivity, labels: Sequence[str]) 
 
 
 def draw_convergence(ax: Axes, front: ParetoFront) -> Axes:
-    """Draw the hypervolume over the evaluations of the search, with the 90 % band of the surrogate's draws."""
+    """Draw the hypervolume over the evaluations of the search, and the 90 % band of the draws."""
     ax.plot(front.evaluations, front.hypervolume, color=_DARK, lw=1.2, label="best estimate")
     if front.uncertainty:
         low, high = np.quantile(front.uncertainty.hypervolumes, [0.05, 0.95])
@@ -283,9 +282,7 @@ def make_figures(exploration: Exploration) -> dict[str, Figure]:
         for ax, pair in zip(axes, pairs, strict=True):
             rest = [i for i in range(k) if i not in pair]
             draw_front(ax, front, pair, rest[0] if rest else None, table.Y, marks)
-        for handle in axes[0].legend(fontsize=7.5, loc="best", framealpha=0.85).legend_handles:
-            handle.set_alpha(1.0)  # the draws are nearly transparent
-            handle.set_sizes([24.0])
+        axes[0].legend(fontsize=7.5, loc="best", framealpha=0.85)
         figures["pareto"] = figure
     pairs = list(combinations(range(d), 2))[:_MAX_PANELS]
     if pairs:

@@ -22,16 +22,17 @@ from drakerock.exploration.problem import Array
 from drakerock.viewing.exploration_figures import make_figures, save_figures
 
 _CAPTIONS = {
-    "contours": "{name}: the surrogate over the first two variables inside each cell, the next two between cells.",
-    "pareto": "The Pareto front in each pair of objectives, coloured by the third. K is the knee; 1, 2 and 3 are "
-    "the reference strategies. Grey clouds are the fronts of draws from the surrogate: where the front may lie.",
+    "contours": """{name}: the surrogate over the first two variables inside each cell, the next two
+        between cells; any further ones as at the knee.""",
+    "pareto": """The Pareto front in each pair of objectives, coloured by the third. K is the knee; 1, 2 and 3
+        are the reference strategies. Grey clouds are the fronts of draws from the surrogate: where it may lie.""",
     "coverage": "Sample and validation points in each pair of variables.",
-    "predicted": "Predicted against simulated. Bars are one standard deviation of the difference. No model gets "
-    "below the noise floor, the validation points' own standard error.",
-    "sensitivity": "Sobol' indices on the surrogate with 95 % intervals: what a variable explains alone (first "
-    "order) and with its interactions (total).",
-    "convergence": "Left: hypervolume of the front during the search; each draw of the surrogate has its own best "
-    "points, so their band tends to lie above. Right: what more sample points brought.",
+    "predicted": """Predicted against simulated. Bars are one standard deviation of the difference. No model
+        gets below the noise floor, the validation points' own standard error.""",
+    "sensitivity": """Sobol' indices on the surrogate with intervals: what a variable explains alone (first
+        order) and with its interactions (total).""",
+    "convergence": """Left: hypervolume of the front during the search; each draw of the surrogate has its own
+        best points, so their band tends to lie above. Right: what more sample points brought.""",
     "confirmation": "Front points simulated again, against what the surrogate said.",
 }
 # Versions of what the numbers depend on.
@@ -56,10 +57,14 @@ def make_report(exploration: Exploration, figures: dict[str, Figure], title: str
     """Return the report as HTML text, figures and scripts inlined."""
     table, problem = exploration.table, exploration.table.problem
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("drakerock.viewing", ""), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
+        loader=jinja2.PackageLoader("drakerock.viewing", ""),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     environment.filters["number"] = _format
+    environment.filters["pm"] = _format_spread
     failures = [i for i in range(len(table)) if table.n_failed[i] or table.failure[i]]
     return environment.get_template("report.html.jinja").render(
         title=title,
@@ -92,7 +97,7 @@ def _make_explorer(exploration: Exploration) -> str:
     points = _list_points(exploration)
     groups = {
         "simulated": (
-            "simulated sample",
+            "simulated",
             {"symbol": "x-thin", "size": 6, "line": {"width": 1, "color": "#9aa1a8"}},
         ),
         "confirmed": ("confirmed", {"symbol": "square-open", "size": 10, "color": "#1b2a41"}),
@@ -117,13 +122,23 @@ def _make_explorer(exploration: Exploration) -> str:
                     "line": {"width": 0.5, "color": "#1b2a41"},
                 }
                 if rest:
-                    low, high = figure.get_subplot(row + 1, column + 1).xaxis.domain
+                    plane = figure.get_subplot(row + 1, column + 1)
+                    low, high = plane.xaxis.domain
                     marker["colorbar"] = {
-                        "orientation": "h", "thickness": 9, "len": high - low, "x": (low + high) / 2, "xanchor": "center",
-                        "y": figure.get_subplot(row + 1, column + 1).yaxis.domain[1] + 0.01, "yanchor": "bottom",
-                        "title": {"text": problem.objectives[shade].label, "side": "top", "font": {"size": 11}},
+                        "orientation": "h",
+                        "thickness": 9,
+                        "len": high - low,
+                        "x": (low + high) / 2,
+                        "xanchor": "center",
+                        "y": plane.yaxis.domain[1] + 0.01,
+                        "yanchor": "bottom",
+                        "title": {
+                            "text": problem.objectives[shade].label,
+                            "side": "top",
+                            "font": {"size": 11},
+                        },
                         "tickfont": {"size": 10},
-                    }  # fmt: skip
+                    }
             figure.add_trace(
                 go.Scatter(
                     x=[points[i]["y"][x] for i in members],
@@ -146,12 +161,20 @@ def _make_explorer(exploration: Exploration) -> str:
             ),
             row + 1, column + 1,
         )  # fmt: skip
-        figure.update_xaxes(
-            title_text=problem.objectives[x].label, title_standoff=4, row=row + 1, col=column + 1
+        place = {"row": row + 1, "col": column + 1}
+        # plotly pushes an axis title clear of tick labels only where they meet: an annotation stays put.
+        figure.add_annotation(
+            text=problem.objectives[x].label,
+            xref="x domain",
+            yref="y domain",
+            x=0.5,
+            y=0.0,
+            yshift=-40,
+            showarrow=False,
+            font={"size": 14},
+            **place,
         )
-        figure.update_yaxes(
-            title_text=problem.objectives[y].label, title_standoff=4, row=row + 1, col=column + 1
-        )
+        figure.update_yaxes(title_text=problem.objectives[y].label, title_standoff=4, **place)
     figure.update_layout(
         template="plotly_white",
         height=430 * rows,
@@ -160,10 +183,13 @@ def _make_explorer(exploration: Exploration) -> str:
         font={"size": 12},
         hovermode="closest",
     )
+    buttons = [["zoom2d", "pan2d", "resetScale2d", "toImage"]]
     html: str = figure.to_html(
-        full_html=False, include_plotlyjs=False, div_id="explorer",
-        config={"displaylogo": False, "responsive": True, "modeBarButtonsToRemove": ["lasso2d", "select2d"]},
-    )  # fmt: skip
+        full_html=False,
+        include_plotlyjs=False,
+        div_id="explorer",
+        config={"displaylogo": False, "responsive": True, "modeBarButtons": buttons},
+    )
     return html
 
 
@@ -238,7 +264,7 @@ def _inline(figure: Figure) -> str:
 
 def _caption(name: str) -> str:
     kind, _, rest = name.partition("_")
-    return _CAPTIONS[kind].format(name=rest)
+    return " ".join(_CAPTIONS[kind].format(name=rest).split())
 
 
 def _embed(data: Any) -> str:
@@ -253,3 +279,9 @@ def _significant(value: float) -> float | None:
 def _format(value: Any, digits: int = 3) -> str:
     """Return a number for a table; a dash where there is none."""
     return "–" if value is None or not np.isfinite(value) else f"{value:.{digits}g}"
+
+
+def _format_spread(value: float | None, spread: float | None) -> str:
+    """Return value ± spread; only the value where no spread is known."""
+    known = spread is not None and np.isfinite(spread)
+    return _format(value, 4) + (f" ± {_format(spread, 2)}" if known else "")
