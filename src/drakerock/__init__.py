@@ -22,7 +22,11 @@ from typing import Any
 __version__ = _version("drakerock")
 
 # Imported on first use, so that `import drakerock` and `drakerock --help` stay fast.
-_LAZY: dict[str, str] = {}
+_LAZY: dict[str, str] = {
+    "Surrogate": "drakerock.exploration.surrogate",
+    "choose_strategy": "drakerock.exploration.strategy",
+    "pareto_front": "drakerock.exploration.pareto",
+}
 
 __all__ = ["__version__", *_LAZY]
 

@@ -12,7 +12,8 @@ from drakerock.errors import InputError
 from drakerock.exploration.problem import Array, Problem
 from drakerock.exploration.surrogate import Surrogate
 
-# From a point (d,) to the mean responses (k,) and their standard errors (k,), natural senses.
+# From a point (d,) to the mean responses (k,) and their standard errors (k,), natural senses. A short
+# sequence knows its own autocorrelation badly: pool it over the study (`noise.calc_autocorrelation`).
 Evaluate = Callable[[Array], tuple[Array, Array]]
 
 

@@ -151,6 +151,14 @@ class Problem(Config):
         return np.array([float(values[name]) for name in self.variable_names])
 
 
+def format_number(value: float, digits: int = 3) -> str:
+    """Return a number for a person, with so many significant digits; - for NaN."""
+    if not np.isfinite(value):
+        return "-"
+    text = f"{value:.{digits}g}"
+    return f"{float(text):.0f}" if "e" in text and 1.0 <= abs(value) < 1e6 else text
+
+
 # The method's reference strategies [alpha, beta, gamma, kappa] (section 6), to draw and compare.
 REFERENCE_STRATEGIES: dict[str, tuple[float, ...]] = {
     "reference 1": (1.3, 0.85, 1.0, 0.6),

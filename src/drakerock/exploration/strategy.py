@@ -10,7 +10,7 @@ import numpy as np
 
 from drakerock.errors import InputError
 from drakerock.exploration.pareto import Bound, ParetoFront
-from drakerock.exploration.problem import Array, Problem
+from drakerock.exploration.problem import Array, Problem, format_number
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Strategy:
         lines.append("Predicted")
         for o, value, std in zip(self.problem.objectives, self.y, self.std, strict=True):
             unit = "" if o.unit == "-" else f" {o.unit}"
-            lines.append(f"  {o.name:<{width}}  {value:.4g} +- {std:.2g}{unit}")
+            lines.append(f"  {o.name:<{width}}  {format_number(value, 4)} +- {format_number(std, 2)}{unit}")
         return "\n".join(lines)
 
 

@@ -127,7 +127,7 @@ def draw_front(
         )
     if front.uncertainty:
         cloud = np.vstack(front.uncertainty.fronts[:20])
-        ax.scatter(cloud[:, x], cloud[:, y], s=3, lw=0, color=_MIDDLE, alpha=0.12)
+        ax.scatter(cloud[:, x], cloud[:, y], s=3, lw=0, color=_MIDDLE, alpha=0.12, rasterized=True)
         ax.scatter([], [], s=12, lw=0, color=_MIDDLE, label="fronts of draws")  # visible in the legend
     colour: dict[str, Any] = (
         {"c": front.Y[:, shade], "cmap": COLORMAP} if shade is not None else {"color": _DARK}

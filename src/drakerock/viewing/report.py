@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import json
 from importlib.metadata import version
 from itertools import combinations
@@ -13,19 +12,18 @@ from typing import Any
 import jinja2
 import numpy as np
 import plotly.graph_objects as go
-from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
 from drakerock.exploration.analysis import Exploration, summarize
-from drakerock.exploration.problem import Array
+from drakerock.exploration.problem import Array, format_number
 from drakerock.viewing.exploration_figures import make_figures, save_figures
 
 _CAPTIONS = {
     "contours": """{name}: the surrogate over the first two variables inside each cell, the next two
         between cells; any further ones as at the knee.""",
     "pareto": """The Pareto front in each pair of objectives, coloured by the third. K is the knee; 1, 2 and 3
-        are the reference strategies. Grey clouds are the fronts of draws from the surrogate: where it may lie.""",
+        are the reference strategies. Grey clouds are fronts of draws of the surrogate: where it may lie.""",
     "coverage": "Sample and validation points in each pair of variables.",
     "predicted": """Predicted against simulated. Bars are one standard deviation of the difference. No model
         gets below the noise floor, the validation points' own standard error.""",
@@ -45,16 +43,17 @@ def write_report(exploration: Exploration, out: Path, title: str = "Exploration"
     Returns the paths, the report first. Equal explorations give equal bytes.
     """
     out.mkdir(parents=True, exist_ok=True)
-    figures = make_figures(exploration)
+    pictures = save_figures(make_figures(exploration), out / "figures")
+    images = {path.stem: path.read_bytes() for path in pictures if path.suffix == ".png"}
     report, summary, pareto = out / "report.html", out / "summary.json", out / "pareto.csv"
-    report.write_text(make_report(exploration, figures, title), encoding="utf-8")
+    report.write_text(make_report(exploration, images, title), encoding="utf-8")
     summary.write_text(json.dumps(summarize(exploration), indent=2) + "\n", encoding="utf-8")
     pareto.write_text(_make_csv(exploration), encoding="utf-8")
-    return [report, summary, pareto, *save_figures(figures, out / "figures")]
+    return [report, summary, pareto, *pictures]
 
 
-def make_report(exploration: Exploration, figures: dict[str, Figure], title: str) -> str:
-    """Return the report as HTML text, figures and scripts inlined."""
+def make_report(exploration: Exploration, images: dict[str, bytes], title: str) -> str:
+    """Return the report as HTML text, scripts and images (PNG, by the names of `make_figures`) inlined."""
     table, problem = exploration.table, exploration.table.problem
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("drakerock.viewing", ""),
@@ -71,8 +70,8 @@ def make_report(exploration: Exploration, figures: dict[str, Figure], title: str
         e=exploration,
         problem=problem,
         summary=summarize(exploration),
-        figures={name: _inline(figure) for name, figure in figures.items()},
-        captions={name: _caption(name) for name in figures},
+        figures={name: base64.b64encode(image).decode() for name, image in images.items()},
+        captions={name: _caption(name) for name in images},
         explorer=_make_explorer(exploration) if len(problem.objectives) > 1 else None,
         plotlyjs=get_plotlyjs() if len(problem.objectives) > 1 else "",
         points=_embed(_list_points(exploration)),
@@ -256,12 +255,6 @@ def _make_csv(exploration: Exploration) -> str:
     return "\n".join([",".join(header), *rows]) + "\n"
 
 
-def _inline(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130, metadata={"Software": None})
-    return base64.b64encode(buffer.getvalue()).decode()
-
-
 def _caption(name: str) -> str:
     kind, _, rest = name.partition("_")
     return " ".join(_CAPTIONS[kind].format(name=rest).split())
@@ -276,9 +269,9 @@ def _significant(value: float) -> float | None:
     return float(f"{value:.6g}") if np.isfinite(value) else None
 
 
-def _format(value: Any, digits: int = 3) -> str:
+def _format(value: float | None, digits: int = 3) -> str:
     """Return a number for a table; a dash where there is none."""
-    return "–" if value is None or not np.isfinite(value) else f"{value:.{digits}g}"
+    return "–" if value is None or not np.isfinite(value) else format_number(value, digits)
 
 
 def _format_spread(value: float | None, spread: float | None) -> str:

@@ -107,6 +107,11 @@ def campaign():
     return make_noisy_table(np.vstack([X, V]), np.random.default_rng(3), n_validation=40)
 
 
+@pytest.fixture(scope="module")
+def fitted(campaign):
+    return fit_surrogate(campaign)
+
+
 class TestNoisyCampaign:
     known = make_noisy_loading()
 
@@ -116,53 +121,49 @@ class TestNoisyCampaign:
         truth = calc_loading_spread(campaign.X) * np.sqrt(tau / 20)
         assert np.median(campaign.noise / truth) == pytest.approx(1.0, abs=0.05)
 
-    def test_error_is_near_the_noise_floor_and_intervals_cover(self, campaign):
-        surrogate = fit_surrogate(campaign)
-        for accuracy in validate(surrogate, campaign):
+    def test_error_is_near_the_noise_floor_and_intervals_cover(self, campaign, fitted):
+        for accuracy in validate(fitted, campaign):
             assert accuracy.validation_nrmse < 1.5 * accuracy.noise_floor
             assert 0.01 < accuracy.noise_floor < 0.05
             assert accuracy.coverage[2] >= 0.85
             assert accuracy.coverage[0] < accuracy.coverage[1] <= accuracy.coverage[2]
             assert accuracy.loo_nrmse < 0.05
 
-    def test_surrogate_is_better_than_the_noise_it_saw(self, campaign):
+    def test_surrogate_is_better_than_the_noise_it_saw(self, campaign, fitted):
         """Against the noise-free truth, the error is well below the standard error of the points."""
-        surrogate = fit_surrogate(campaign)
         Z = self.known.problem.unscale(np.random.default_rng(9).uniform(-1, 1, (2000, 4)))
-        mean, std = surrogate.predict(Z, return_std=True)
+        mean, std = fitted.predict(Z, return_std=True)
         truth = self.known.evaluate(Z)
         rms = np.sqrt(np.mean((mean - truth) ** 2, axis=0))
         assert np.all(rms < 0.6 * np.sqrt(np.mean(campaign.noise**2, axis=0)))
         within = np.mean(np.abs(mean - truth) < 1.96 * std, axis=0)
         assert np.all(within > 0.8)
 
-    def test_front_is_near_the_exact_one(self, campaign):
-        surrogate = fit_surrogate(campaign)
-        front = pareto_front(surrogate, config=ParetoConfig(n_draws=0))
+    def test_front_is_near_the_exact_one(self, fitted):
+        front = pareto_front(fitted, config=ParetoConfig(n_draws=0))
         exact = self.known.make_front(2000)
         scale = np.ptp(exact, axis=0)
         true = self.known.evaluate(front.X)  # what the strategies found are really worth
         assert cdist(true / scale, exact / scale).min(axis=1).mean() < 0.05
         assert cdist(exact / scale, true / scale).min(axis=1).mean() < 0.06
 
-    def test_confirmation_agrees_where_the_surrogate_is_right(self, campaign):
-        surrogate = fit_surrogate(campaign)
-        front = pareto_front(surrogate, config=ParetoConfig(population=60, evaluations=3000, n_draws=0))
+    def test_confirmation_agrees_where_the_surrogate_is_right(self, fitted):
+        front = pareto_front(fitted, config=ParetoConfig(population=60, evaluations=3000, n_draws=0))
         rng = np.random.default_rng(8)
 
         def simulate(x):
             table = make_noisy_table(x[None], rng)
             return table.Y[0], table.noise[0]
 
-        result = confirm_points(surrogate, front.X[:15], simulate)
+        result = confirm_points(fitted, front.X[:15], simulate)
         # One sequence knows its own autocorrelation badly, so its standard error is rough.
         assert np.mean(np.abs(result.z) < 3.0) > 0.85
-        wrong = confirm_points(surrogate, front.X[:15], lambda x: (simulate(x)[0] * 1.3, simulate(x)[1]))
+        wrong = confirm_points(fitted, front.X[:15], lambda x: (simulate(x)[0] * 1.3, simulate(x)[1]))
         assert np.mean(np.abs(wrong.z) < 3.0) < 0.5
 
-    def test_validation_refuses_another_table(self, campaign):
+    def test_validation_refuses_another_table(self, campaign, fitted):
         with pytest.raises(InputError, match="not fitted"):
-            validate(fit_surrogate(campaign), campaign.take(list(range(50))))
+            validate(fitted, campaign.take(list(range(50))))
 
 
 def test_confirmation_keeps_failures_and_round_trips():

@@ -46,10 +46,8 @@ def test_prediction_solves_the_method_s_equations():
         w = np.linalg.solve(psi + lam * np.eye(25), y - y.mean())
         Z = np.array([[0.3, 4.0], [9.0, 14.0]])
         uz = 2 * (Z - [-5, 0]) / [15, 15] - 1
-        expected = [
-            y.mean() + sum(wi * np.exp(-np.sum(theta * np.abs(z - a) ** p)) for wi, a in zip(w, u))
-            for z in uz
-        ]  # noqa: B905, E501
+        psi_z = [[np.exp(-np.sum(theta * np.abs(z - a) ** p)) for a in u] for z in uz]
+        expected = y.mean() + np.array(psi_z) @ w
         assert model.predict(Z) == pytest.approx(expected, rel=1e-7)
         assert model.weights_ == pytest.approx(w, rel=1e-5)
 
