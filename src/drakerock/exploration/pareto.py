@@ -1,4 +1,11 @@
-"""The Pareto front on the surrogate (method section 6): NSGA-II, hypervolume, constraints, uncertainty."""
+"""The Pareto front on the surrogate (method section 6): NSGA-II, hypervolume, constraints, uncertainty.
+
+Plain dominance on a surrogate is misled by its smallest errors: a point whose production is predicted a
+millionth higher would stand on the front however much worse the rest is. The front is therefore the set of
+properly efficient points (Geoffrion 1968) with bounded trade-off: a gain must not cost more than M times as much
+in another objective, both in ranges of the objectives. With y the normalised objectives this is plain dominance of
+A y, A = I + (1 1^T - I) / M; the default M = 100 removes nothing that anyone would choose.
+"""
 
 from __future__ import annotations
 
@@ -67,6 +74,9 @@ class ParetoConfig(Config):
     population: int = Field(default=300, ge=4)
     evaluations: int = Field(default=40_000, ge=100, description="evaluations of the surrogate, about")
     bounds: tuple[Bound, ...] = Field(default=(), description="limits on objectives")
+    max_trade_off: float | None = Field(
+        default=100.0, gt=1.0, description="M, bound of the trade-off between objectives; null: none"
+    )
     n_draws: int = Field(default=64, ge=0, description="draws of the surrogate for the front's uncertainty")
 
 
@@ -153,7 +163,8 @@ def pareto_front(
     signs = problem.signs
     for bound in limits:
         problem.get_objective(bound.objective)
-    search = _Search(surrogate, problem, limits)
+    cone = _make_cone(surrogate, problem, config.max_trade_off, seed)
+    search = _Search(surrogate, problem, limits, cone)
     history = _History()
     result = minimize(
         search,
@@ -167,14 +178,16 @@ def pareto_front(
     U = np.atleast_2d(result.X)
     X = problem.unscale(U)
     Y, std = surrogate.predict(X, return_std=True)
-    keep = calc_non_dominated(Y * signs)
+    keep = calc_non_dominated(Y @ cone.T)
     keep = keep[np.argsort((Y * signs)[keep, 0], kind="stable")]
     X, Y, std = X[keep], Y[keep], std[keep]
     best, worst = (Y * signs).min(axis=0), (Y * signs).max(axis=0)
     spread = np.where(worst > best, worst - best, 1.0)
     reference = worst + 0.1 * spread
     box = float(np.prod(reference - best))
-    volumes = [_calc_hypervolume(F, reference) / box for F in history.fronts]
+    # Back from the cone's coordinates to minimised objectives.
+    inverse = np.linalg.inv(cone).T * signs
+    volumes = [_calc_hypervolume(C @ inverse, reference) / box for C in history.fronts]
     front = ParetoFront(
         problem,
         X,
@@ -189,7 +202,7 @@ def pareto_front(
     )
     if config.n_draws and hasattr(surrogate, "draw"):
         pool = problem.unscale(history.sample_pool(make_generator(seed, "front pool")))
-        front = _add_uncertainty(front, surrogate, pool, config.n_draws, seed)
+        front = _add_uncertainty(front, surrogate, pool, cone, config.n_draws, seed)
     return front
 
 
@@ -223,16 +236,16 @@ def select_spread(front: ParetoFront, n: int, first: Sequence[int] = ()) -> Indi
 
 
 class _Search(PymooProblem):  # type: ignore[misc]
-    """The surrogate as pymoo sees it: minimised objectives over [-1, 1]^d."""
+    """The surrogate as pymoo sees it: objectives in the coordinates of the trade-off cone, over [-1, 1]^d."""
 
-    def __init__(self, surrogate: Model, problem: Problem, bounds: Sequence[Bound]) -> None:
+    def __init__(self, surrogate: Model, problem: Problem, bounds: Sequence[Bound], cone: Array) -> None:
         d, k = len(problem.variables), len(problem.objectives)
         super().__init__(n_var=d, n_obj=k, n_ieq_constr=len(bounds), xl=-np.ones(d), xu=np.ones(d))
-        self._surrogate, self._problem, self._bounds = surrogate, problem, bounds
+        self._surrogate, self._problem, self._bounds, self._cone = surrogate, problem, bounds, cone
 
     def _evaluate(self, x: Array, out: dict[str, Array], *args: Any, **kwargs: Any) -> None:
         Y = self._surrogate.predict(self._problem.unscale(x))
-        out["F"] = Y * self._problem.signs
+        out["F"] = Y @ self._cone.T
         if self._bounds:
             out["G"] = np.column_stack([bound.calc_violation(self._problem, Y) for bound in self._bounds])
 
@@ -264,20 +277,32 @@ def _calc_hypervolume(F: Array, reference: Array) -> float:
     return float(HV(ref_point=reference)(inside)) if len(inside) else 0.0
 
 
-def _add_uncertainty(front: ParetoFront, surrogate: Any, pool: Array, n_draws: int, seed: int) -> ParetoFront:
+def _make_cone(surrogate: Model, problem: Problem, max_trade_off: float | None, seed: int) -> Array:
+    """Return C (k, k): plain dominance of C y, y natural objectives, is dominance with bounded trade-off."""
+    k = len(problem.objectives)
+    U = make_generator(seed, "ranges").uniform(-1.0, 1.0, (1000, len(problem.variables)))
+    ranges = np.ptp(surrogate.predict(problem.unscale(U)), axis=0)
+    slope = 0.0 if max_trade_off is None else 1.0 / max_trade_off
+    cone = np.eye(k) + slope * (np.ones((k, k)) - np.eye(k))
+    return cone * problem.signs / np.where(ranges > 0.0, ranges, 1.0)
+
+
+def _add_uncertainty(
+    front: ParetoFront, surrogate: Any, pool: Array, cone: Array, n_draws: int, seed: int
+) -> ParetoFront:
     signs = front.problem.signs
     candidates = np.vstack([front.X, pool])
-    draws = surrogate.draw(candidates, n_draws, make_generator(seed, "front draws")) * signs
+    draws = surrogate.draw(candidates, n_draws, make_generator(seed, "front draws"))
     reference = front.reference * signs
     box = float(np.prod(reference - front.ideal * signs))
     counts = np.zeros(len(front))
     volumes, fronts = [], []
-    for F in draws:
+    for Y in draws:
         # A bound is a statement about the prediction: the candidates satisfy it, their draws need not.
-        best = calc_non_dominated(F)
+        best = calc_non_dominated(Y @ cone.T)
         counts[best[best < len(front)]] += 1
-        volumes.append(_calc_hypervolume(F[best], reference) / box)
-        fronts.append(F[best] * signs)
+        volumes.append(_calc_hypervolume(Y[best] * signs, reference) / box)
+        fronts.append(Y[best])
     uncertainty = FrontUncertainty(counts / n_draws, np.array(volumes), tuple(fronts))
     return replace(front, uncertainty=uncertainty)
 

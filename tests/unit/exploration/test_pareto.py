@@ -83,6 +83,40 @@ def test_non_dominated_by_definition(F):
     assert len(np.unique(F[kept], axis=0)) == len(kept)
 
 
+def test_tiny_surrogate_errors_make_no_false_front():
+    """f1 = x1 with errors of a millionth: with plain dominance walls of bad points stand at its best end."""
+    exact = make_zdt(1)
+
+    class Nearly(Exact):
+        def predict(self, X, return_std=False):
+            Y = exact.evaluate(np.asarray(X))
+            Y[:, 0] += 1e-6 * np.sin(40 * np.asarray(X)[:, 1:]).sum(axis=1)
+            return (Y, 0 * Y) if return_std else Y
+
+    def calc_worst(max_trade_off):
+        config = ParetoConfig(population=100, evaluations=15_000, n_draws=0, max_trade_off=max_trade_off)
+        front = pareto_front(Nearly(exact), config=config)
+        return cdist(exact.evaluate(front.X), exact.make_front(1000)).min(axis=1).max()
+
+    assert calc_worst(100.0) < 0.05
+    assert calc_worst(None) > 0.3
+
+
+def test_trade_off_bound_is_geoffrion_s():
+    """No kept point loses more than M times its gain against another; every dropped one does, or is dominated."""
+    known = make_dtlz2()
+    config = ParetoConfig(population=60, evaluations=3000, n_draws=0, max_trade_off=5.0)
+    front = pareto_front(Exact(known), config=config)
+    scale = np.ptp(known.evaluate(np.random.default_rng(0).uniform(0, 1, (5000, 6))), axis=0)
+    y = front.Y / scale
+    for i, a in enumerate(y):
+        for j, b in enumerate(y):
+            if i == j:
+                continue
+            gain, loss = np.maximum(b - a, 0).sum(), np.maximum(a - b, 0).max()
+            assert gain > loss / 5.0 * 0.85, "ranges are sampled, hence the margin"
+
+
 def test_hypervolume_against_a_box():
     """One point of a two-objective front fills its box to the reference; the share is one."""
     problem = Problem(
