@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/exploration.py [speed] [accuracy] [sampling] [smt] [--json FILE]
 
-Without names, all four are run (about two minutes on one core). The figures in docs/exploration.md are its output.
+Without names, all four are run (some minutes on one core). The figures in docs/exploration.md are its output.
 """
 
 from __future__ import annotations
@@ -95,36 +95,33 @@ def measure_speed() -> list[Row]:
     samples = table.select("sample")
     batch = np.random.default_rng(0).uniform(samples.problem.low, samples.problem.high, (40_000, 4))
     config = ParetoConfig(n_draws=0)
-    sampler = make_sampler(samples.problem, SamplingConfig(), 2)
-    sampler.tell(X[:196], samples.Y[:196], samples.noise[:196])
-    rows: list[Row] = [
-        {"what": "fit, 3 objectives, 204 points, known noise [s]", "value": take_time(lambda: fit_surrogate(table)),
-         "target": 5.0},
-        {"what": "fit, 3 objectives, 204 points, unknown noise [s]",
-         "value": take_time(lambda: Surrogate(samples.problem).fit(samples.X, samples.Y)), "target": 5.0},
-        {"what": "NSGA-II, population 300, 40 000 evaluations [s]",
-         "value": take_time(lambda: pareto_front(surrogate, config=config)), "target": 10.0},
-        {"what": "the same with 64 draws for its uncertainty [s]", "value": take_time(lambda: pareto_front(surrogate)),
-         "target": None},
-        {"what": "prediction in a batch, 3 objectives [us/point]",
-         "value": take_time(lambda: surrogate.predict(batch)) / len(batch) * 1e6, "target": 10.0},
-        {"what": "prediction with standard deviation [us/point]",
-         "value": take_time(lambda: surrogate.predict(batch, return_std=True)) / len(batch) * 1e6, "target": 10.0},
-        {"what": "Sobol' indices, 3 objectives, 6 144 evaluations [s]",
-         "value": take_time(lambda: calc_sensitivity(surrogate.predict, samples.problem)), "target": None},
-    ]  # fmt: skip
+    rows: list[Row] = []
+
+    def add(what: str, value: float, target: float | None = None) -> None:
+        rows.append({"what": what, "value": value, "target": target})
+
+    add("fit, 3 objectives, 204 points, known noise, s", take_time(lambda: fit_surrogate(table)), 5.0)
+    unknown = Surrogate(samples.problem)
+    add("the same, unknown noise, s", take_time(lambda: unknown.fit(samples.X, samples.Y)), 5.0)
+    add("NSGA-II, 40 000 evaluations, s", take_time(lambda: pareto_front(surrogate, config=config)), 10.0)
+    add("the same and 64 draws for its uncertainty, s", take_time(lambda: pareto_front(surrogate)))
+    micro = 1e6 / len(batch)
+    add("batch prediction, 3 objectives, us/point", micro * take_time(lambda: surrogate.predict(batch)), 10.0)
+    with_std = micro * take_time(lambda: surrogate.predict(batch, return_std=True))
+    add("the same with standard deviation, us/point", with_std, 10.0)
+    add("Sobol' indices, s", take_time(lambda: calc_sensitivity(surrogate.predict, samples.problem)))
     for name, kind in SAMPLERS.items():
         one = kind(samples.problem, SamplingConfig(), 2)
         one.tell(X[:196], samples.Y[:196], samples.noise[:196])
         seconds = take_time(lambda one=one: one.ask(8), repeat=1)
-        rows.append({"what": f"sampler {name}: 8 points after 196 [s]", "value": seconds, "target": None})
+        add(f"sampler {name}, 8 points after 196, s", seconds)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cycles.csv"
         write_cycles(path, X, V)
         seconds = take_time(lambda: run_report(path), repeat=1)
         size = (Path(folder) / "report" / "report.html").stat().st_size / 1e6
-    rows.append({"what": "report on a table of 4 880 cycles [s]", "value": seconds, "target": 60.0})
-    rows.append({"what": "size of report.html [MB]", "value": size, "target": None})
+    add("report on a table of 4 880 cycles, s", seconds, 60.0)
+    add("size of report.html, MB", size)
     return rows
 
 
@@ -148,9 +145,15 @@ class Truth:
 def measure_accuracy() -> list[Row]:
     rows = []
     cases = [
-        (make_branin(), 40), (make_ishigami(), 200), (make_zdt(1), 100), (make_zdt(2), 100), (make_zdt(3), 200),
-        (make_dtlz2(), 150), (make_noisy_loading(), 204),
-    ]  # fmt: skip
+        (make_branin(), 40),
+        (make_ishigami(), 200),
+        (make_zdt(1), 100),
+        (make_zdt(2), 100),
+        (make_zdt(3), 200),
+        (make_dtlz2(), 150),
+        (make_dtlz2(), 300),
+        (make_noisy_loading(), 204),
+    ]
     for known, n in cases:
         d = len(known.problem.variables)
         if known.name == "noisy loading":
@@ -169,10 +172,10 @@ def measure_accuracy() -> list[Row]:
         if known.first is not None and known.total is not None:
             indices = calc_sensitivity(surrogate.predict, known.problem, SensitivityConfig(n_base=4096))
             row["Sobol' S1, largest error"] = max(
-                np.abs(s.first - f).max() for s, f in zip(indices, known.first)
+                np.abs(s.first - f).max() for s, f in zip(indices, known.first, strict=True)
             )
             row["Sobol' ST, largest error"] = max(
-                np.abs(s.total - t).max() for s, t in zip(indices, known.total)
+                np.abs(s.total - t).max() for s, t in zip(indices, known.total, strict=True)
             )
         if known.make_front is not None:
             exact = known.make_front(2000)
@@ -192,8 +195,8 @@ def measure_accuracy() -> list[Row]:
 def print_validation(accuracies: Any) -> None:
     for a in accuracies:
         Console().print(
-            f"noisy loading, {a.objective}: leave-one-out NRMSE {a.loo_nrmse:.4f}, validation {a.validation_nrmse:.4f}, "
-            f"noise floor {a.noise_floor:.4f}, coverage of 50/80/95 %: {', '.join(f'{c:.3f}' for c in a.coverage)}"
+            f"noisy {a.objective}: leave-one-out {a.loo_nrmse:.4f}, validation {a.validation_nrmse:.4f}, "
+            f"floor {a.noise_floor:.4f}, inside 50/80/95 %: {', '.join(f'{c:.3f}' for c in a.coverage)}"
         )
 
 
@@ -230,13 +233,13 @@ def measure_sampling() -> list[Row]:
             found = pareto_front(
                 surrogate, config=ParetoConfig(population=150, evaluations=10_000, n_draws=0)
             )
-            error["front"].append(calc_front_distances(noisy.evaluate(found.X), exact)[0])
+            error["front"].append(sum(calc_front_distances(noisy.evaluate(found.X), exact)) / 2)
         rows.append(
             {
                 "sampler": " + ".join(methods),
                 "Ishigami, 120 points: NRMSE": np.mean(error["ishigami"]),
                 "noisy loading, 104 points: NRMSE": np.mean(error["noisy"]),
-                "its front: distance to the exact": np.mean(error["front"]),
+                "its front: mean distance to the exact": np.mean(error["front"]),
             }
         )
     return rows
@@ -256,9 +259,17 @@ def measure_smt() -> list[Row]:
             y = known.evaluate(X)[:, j]
             y = y + 0.03 * y.std() * rng.standard_normal(len(y))
             other = KRG(
-                theta0=[1.0] * d, theta_bounds=[1e-6, 100.0], eval_noise=True, noise0=[1e-2], noise_bounds=[1e-9, 10.0],
-                n_start=40, print_global=False, poly="constant", corr="squar_exp", nugget=0.0,
-            )  # fmt: skip
+                theta0=[1.0] * d,
+                theta_bounds=[1e-6, 100.0],
+                eval_noise=True,
+                noise0=[1e-2],
+                noise_bounds=[1e-9, 10.0],
+                n_start=40,
+                print_global=False,
+                poly="constant",
+                corr="squar_exp",
+                nugget=0.0,
+            )
             other.set_training_values(X, y)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

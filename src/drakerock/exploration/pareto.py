@@ -2,9 +2,10 @@
 
 Plain dominance on a surrogate is misled by its smallest errors: a point whose production is predicted a
 millionth higher would stand on the front however much worse the rest is. The front is therefore the set of
-properly efficient points (Geoffrion 1968) with bounded trade-off: a gain must not cost more than M times as much
-in another objective, both in ranges of the objectives. With y the normalised objectives this is plain dominance of
-A y, A = I + (1 1^T - I) / M; the default M = 100 removes nothing that anyone would choose.
+properly efficient points (Geoffrion 1968) with bounded trade-off: a gain must not cost more than M times as
+much in the other objectives, all in ranges of the objectives over the design space. With y the objectives
+over their ranges this is plain dominance of A y, A = I + (1 1^T - I) / M. The default M = 50 takes away what
+gains less than 2 % of one range at the cost of all of another: about what a surrogate can tell apart.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class ParetoConfig(Config):
     evaluations: int = Field(default=40_000, ge=100, description="evaluations of the surrogate, about")
     bounds: tuple[Bound, ...] = Field(default=(), description="limits on objectives")
     max_trade_off: float | None = Field(
-        default=100.0, gt=1.0, description="M, bound of the trade-off between objectives; null: none"
+        default=50.0, gt=1.0, description="M, bound of the trade-off between objectives; null: none"
     )
     n_draws: int = Field(default=64, ge=0, description="draws of the surrogate for the front's uncertainty")
 

@@ -1,4 +1,4 @@
-"""The exploration against problems with known truth, with stated tolerances, and what is derived from a fit."""
+"""The exploration against problems with known truth, with stated tolerances, and what follows from a fit."""
 
 import numpy as np
 import pytest
@@ -93,7 +93,7 @@ def test_constant_response_has_no_sensitivities():
 
 @pytest.fixture(scope="module")
 def campaign():
-    """The whole campaign of section 6 on the noisy problem: initial design, sequential batches, validation."""
+    """The campaign of section 6 on the noisy problem: initial design, sequential batches, validation."""
     known, config = make_noisy_loading(), SamplingConfig(batch_size=16)
     sampler = make_sampler(known.problem, config, seed=2)
     X = sampler.ask(40)

@@ -98,12 +98,12 @@ def test_tiny_surrogate_errors_make_no_false_front():
         front = pareto_front(Nearly(exact), config=config)
         return cdist(exact.evaluate(front.X), exact.make_front(1000)).min(axis=1).max()
 
-    assert calc_worst(100.0) < 0.05
+    assert calc_worst(50.0) < 0.05
     assert calc_worst(None) > 0.3
 
 
 def test_trade_off_bound_is_geoffrion_s():
-    """No kept point loses more than M times its gain against another; every dropped one does, or is dominated."""
+    """No kept point pays more than M times its gain against another."""
     known = make_dtlz2()
     config = ParetoConfig(population=60, evaluations=3000, n_draws=0, max_trade_off=5.0)
     front = pareto_front(Exact(known), config=config)

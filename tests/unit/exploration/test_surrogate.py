@@ -188,9 +188,17 @@ def test_agreement_with_smt(make, seed):
     X, Y = make_data(known, 25 * d, seed, noise=0.03)
     y = Y[:, 0]
     other = smt.KRG(
-        theta0=[1.0] * d, theta_bounds=[1e-6, 100.0], eval_noise=True, noise0=[1e-2], noise_bounds=[1e-9, 10.0],
-        n_start=40, print_global=False, poly="constant", corr="squar_exp", nugget=0.0,
-    )  # fmt: skip
+        theta0=[1.0] * d,
+        theta_bounds=[1e-6, 100.0],
+        eval_noise=True,
+        noise0=[1e-2],
+        noise_bounds=[1e-9, 10.0],
+        n_start=40,
+        print_global=False,
+        poly="constant",
+        corr="squar_exp",
+        nugget=0.0,
+    )
     other.set_training_values(X, y)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -147,7 +147,8 @@ def test_page_runs_in_a_browser_without_errors(written, exploration, tmp_path):
     """The console stays free, and the page's own choice by weights is that of choose_strategy."""
     command = [
         find_browser(), "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
-        "--disable-component-update", "--disable-sync", f"--user-data-dir={tmp_path}", "--enable-logging=stderr",
+        "--disable-component-update", "--disable-sync", f"--user-data-dir={tmp_path}",
+        "--enable-logging=stderr",
         "--virtual-time-budget=5000", "--dump-dom", written[0].as_uri(),
     ]  # fmt: skip
     result = subprocess.run(command, capture_output=True, text=True, timeout=90)
