@@ -90,6 +90,13 @@ def test_nothing_but_failures_still_gives_points(methods):
     assert len(rows(sampler.ask(5))) == 5
 
 
+def test_a_batch_may_be_larger_than_what_was_told(methods):
+    sampler = make(methods)
+    X = sampler.ask(14)
+    sampler.tell(X, KNOWN.evaluate(X))
+    assert len(rows(sampler.ask(40))) == 40
+
+
 def test_constant_responses_still_give_points(methods):
     sampler = make(methods)
     X = sampler.ask(14)

@@ -191,8 +191,10 @@ class LolaVoronoiSampler(Sampler):
             y[~good] = y[good][nearest]
         with _seed_openturns(derive_seed(self.seed, "lola-voronoi", len(U))):
             algorithm = LOLAVoronoi(U, y, _make_uniform(d))
-            proposed = np.array(algorithm.generate(n))
-        return np.clip(proposed, -1.0, 1.0)
+            proposed = np.clip(np.array(algorithm.generate(min(n, len(U)))), -1.0, 1.0)
+        # One new point per told point and batch is what the method can give.
+        rest = _spread(self._make_candidates(len(U)), np.vstack([U, proposed]), n - len(proposed))
+        return np.vstack([proposed, rest])
 
 
 class ErrorSampler(Sampler):

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drakerock.errors import InputError
-from drakerock.exploration.pareto import Bound, ParetoConfig, pareto_front
+from drakerock.exploration.pareto import Bound, ParetoConfig, ParetoFront, pareto_front
+from drakerock.exploration.problem import Objective, Problem, Variable
 from drakerock.exploration.problems import make_noisy_loading
 from drakerock.exploration.strategy import choose_strategy, parse_weights
 from drakerock.exploration.surrogate import Surrogate
@@ -39,6 +40,28 @@ def test_more_weight_never_makes_an_objective_worse(front, weights, j, factor):
     # Up to the small sum that breaks ties.
     slack = 5e-3 * abs(front.nadir[j] - front.ideal[j])
     assert sign * after.y[j] <= sign * before.y[j] + slack
+
+
+def test_weights_reach_into_hollows_of_the_front():
+    """On three points of a hollow front a weighted sum could only ever choose an end."""
+    problem = Problem(
+        variables=(Variable(name="x", low=0, high=1),), objectives=(Objective(name="a"), Objective(name="b"))
+    )
+    Y = np.array([[0.0, 1.0], [0.6, 0.6], [1.0, 0.0]])
+    ends = np.array([0.0, 0.0]), np.array([1.0, 1.0])
+    front = ParetoFront(
+        problem,
+        np.array([[0.0], [0.5], [1.0]]),
+        Y,
+        0 * Y,
+        *ends,
+        ends[1] + 0.1,
+        np.array([1.0]),
+        np.array([0.1]),
+    )
+    assert choose_strategy(front, {"a": 1, "b": 1}).index == 1
+    assert choose_strategy(front, {"a": 3, "b": 1}).index == 0
+    assert choose_strategy(front).index == 0  # the knee is no point of a hollow
 
 
 @given(st.floats(0.01, 100.0))

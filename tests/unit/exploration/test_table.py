@@ -1,6 +1,8 @@
 import json
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -70,6 +72,18 @@ def test_one_row_per_loading_is_averaged(tmp_path):
     assert np.isnan(table.noise[1]).all()
     assert table.noise[0, 1] == 0.0
     assert table.noise[0, 2] > 0.0
+
+
+def test_empty_cells_of_parquet(tmp_path):
+    arrow = make_table(3).to_arrow()
+    for name in ("failure", "replay", "production", "n_failed"):
+        column = arrow.column(name)
+        arrow = arrow.set_column(arrow.column_names.index(name), name, pa.nulls(3, column.type))
+    pq.write_table(arrow, tmp_path / "responses.parquet")
+    table = ResponseTable.load(tmp_path)
+    assert table.failure == table.replay == ("", "", "")
+    assert table.n_failed == (0, 0, 0)
+    assert np.isnan(table.Y[:, 0]).all()
 
 
 def test_loadings_are_put_in_order():
