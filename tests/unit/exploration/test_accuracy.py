@@ -78,9 +78,9 @@ def test_intervals_of_the_indices_hold_the_truth():
 def test_exact_indices_agree_with_brute_force():
     """The closed forms of the noisy loading problem against a large sample of the exact function."""
     known = make_noisy_loading()
-    for j, s in enumerate(calc_sensitivity(known.evaluate, known.problem, SensitivityConfig(n_base=2**15))):
-        assert s.first == pytest.approx(known.first[j], abs=0.01)
-        assert s.total == pytest.approx(known.total[j], abs=0.01)
+    for j, s in enumerate(calc_sensitivity(known.evaluate, known.problem, SensitivityConfig(n_base=2**13))):
+        assert s.first == pytest.approx(known.first[j], abs=0.015)
+        assert s.total == pytest.approx(known.total[j], abs=0.015)
 
 
 def test_constant_response_has_no_sensitivities():

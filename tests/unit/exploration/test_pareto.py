@@ -45,7 +45,8 @@ def calc_distances(front, known):
     ("known", "config", "tolerance"),
     [
         (make_zdt(1), ParetoConfig(n_draws=0), (0.005, 0.005)),
-        (make_zdt(2), ParetoConfig(n_draws=0), (0.005, 0.005)),
+        # The trade-off bound takes the flat tip of the hollow front, f1 < 0.1 or so, for its end.
+        (make_zdt(2), ParetoConfig(n_draws=0), (0.005, 0.01)),
         (make_zdt(3), ParetoConfig(n_draws=0), (0.005, 0.01)),
         (make_dtlz2(), ParetoConfig(n_draws=0), (0.03, 0.05)),
         (make_noisy_loading(), ParetoConfig(n_draws=0), (0.03, 0.04)),
@@ -203,12 +204,8 @@ def test_resampling_is_sure_of_exact_data_and_unsure_of_noise():
     Y = known.evaluate(X)
     config = ParetoConfig(population=60, evaluations=6000, n_draws=40)
     noisy = Y + 0.1 * Y.std(axis=0) * np.random.default_rng(1).standard_normal(Y.shape)
-    exact_spread, noisy_spread = (
-        pareto_front(Surrogate(known.problem).fit(X, data), config=config).uncertainty.hypervolumes.std()
-        for data in (Y, noisy)
-    )
-    assert noisy_spread > 3 * exact_spread
-    front = pareto_front(Surrogate(known.problem).fit(X, noisy), config=config)
+    exact, front = (pareto_front(Surrogate(known.problem).fit(X, data), config=config) for data in (Y, noisy))
+    assert front.uncertainty.hypervolumes.std() > 3 * exact.uncertainty.hypervolumes.std()
     assert np.all((front.uncertainty.p_optimal >= 0) & (front.uncertainty.p_optimal <= 1))
     # The best production of all is optimal in more draws than the typical front point.
     assert front.uncertainty.p_optimal[0] > np.median(front.uncertainty.p_optimal)
