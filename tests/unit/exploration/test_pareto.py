@@ -45,7 +45,7 @@ def calc_distances(front, known):
     ("known", "config", "tolerance"),
     [
         (make_zdt(1), ParetoConfig(n_draws=0), (0.005, 0.005)),
-        # The trade-off bound takes the flat tip of the hollow front, f1 < 0.1 or so, for its end.
+        # The trade-off bound takes the flat tip of the hollow front, f1 < 0.2 or so, for its end.
         (make_zdt(2), ParetoConfig(n_draws=0), (0.005, 0.01)),
         (make_zdt(3), ParetoConfig(n_draws=0), (0.005, 0.01)),
         (make_dtlz2(), ParetoConfig(n_draws=0), (0.03, 0.05)),
