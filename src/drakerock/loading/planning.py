@@ -297,7 +297,9 @@ def _integrate_lift(
     """Integrate [s1, s2] as the controller would drive it on a machine that follows exactly."""
     length, height = tables.v_x.at[-1], tables.v_z.at[-1]
     psi_end = tables.omega.at[-1]
-    dt = length / config.v_x_max / config.n_segment
+    # Fine steps, so that the three coordinates reach the waypoint together; one in eight is kept.
+    fine = 8
+    dt = length / config.v_x_max / (config.n_segment * fine)
     z0 = float(calc_tip(kin, 0.0, phi_l, phi_b)[1])
     rows = [(0.0, 0.0, 0.0, phi_l, phi_b, 0.0)]
     x = z = psi = t = 0.0
@@ -315,6 +317,7 @@ def _integrate_lift(
         psi = float(calc_pitch(kin, phi_l, phi_b))
         z = float(calc_tip(kin, 0.0, phi_l, phi_b)[1]) - z0
         rows.append((x, z, psi, phi_l, phi_b, t))
+    rows = rows[:-1:fine] + rows[-1:]
     return _Path(*np.array(rows).T)
 
 
