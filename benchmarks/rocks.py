@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import platformdirs
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
 from drakerock.dynamics.assembly import add_plant, add_site
 from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
@@ -44,7 +44,14 @@ TIME_STEP = 0.01
 
 def make_engine(pile: PileState, site: SiteConfig = SITE, **settings: object) -> NonsmoothEngine:
     return NonsmoothEngine(
-        ROCKS, SHAPES, make_site(site), NonsmoothConfig(**settings), TIME_STEP, pile.shape, pile.size, pile.fixed
+        ROCKS,
+        SHAPES,
+        make_site(site),
+        NonsmoothConfig(**settings),
+        TIME_STEP,
+        pile.shape,
+        pile.size,
+        pile.fixed,
     )
 
 
@@ -62,7 +69,10 @@ def get_pile(seed: int = 0, n: int = 7500, site: SiteConfig = SITE) -> PileState
 
     def report(t: float, waiting: int, step: object) -> None:
         if round(t / TIME_STEP) % 500 == 0:
-            print(f"  filling: {t:.0f} s, {waiting} waiting, {time.perf_counter() - start:.0f} s wall", flush=True)
+            print(
+                f"  filling: {t:.0f} s, {waiting} waiting, {time.perf_counter() - start:.0f} s wall",
+                flush=True,
+            )
 
     pile, waiting = fill(engine, pile, np.arange(n), site, FILLING, rng, report)
     pile = pile.select(np.setdiff1d(np.flatnonzero(pile.p_WRs[:, 2] > -1.0), waiting))
@@ -177,7 +187,11 @@ def clear_way(pile: PileState) -> PileState:
 
 
 def build_dig(
-    pile: PileState, rates: Rates, config: NonsmoothConfig, time_step: float = TIME_STEP, site: SiteConfig = SITE
+    pile: PileState,
+    rates: Rates,
+    config: NonsmoothConfig,
+    time_step: float = TIME_STEP,
+    site: SiteConfig = SITE,
 ) -> tuple[Simulator, object, Machine, NonsmoothRocks]:
     """Return simulator, plant, machine and rocks of a dig, the bucket's tip 1 m before the toe."""
     dynamics = DynamicsConfig(rocks="nonsmooth", nonsmooth=config, time_step=time_step)

@@ -11,7 +11,10 @@ N = 3
 
 
 def strip(outcomes):
-    return [{k: v for k, v in asdict(item).items() if k not in ("wall_time_s", "ms_per_step")} for item in outcomes]
+    return [
+        {k: v for k, v in asdict(item).items() if k not in ("wall_time_s", "ms_per_step")}
+        for item in outcomes
+    ]
 
 
 @pytest.fixture(scope="module")

@@ -332,13 +332,29 @@ def _solve_packed(rows, k, bodies, a, b):
     nx, ny, nz = rows[k, NORMAL], rows[k, NORMAL + 1], rows[k, NORMAL + 2]
     ax, ay, az = rows[k, ARM_A], rows[k, ARM_A + 1], rows[k, ARM_A + 2]
     bx, by, bz = rows[k, ARM_B], rows[k, ARM_B + 1], rows[k, ARM_B + 2]
-    w0, w1, w2, v0, v1, v2 = bodies[a, 0], bodies[a, 1], bodies[a, 2], bodies[a, 3], bodies[a, 4], bodies[a, 5]
-    s0, s1, s2, u0, u1, u2 = bodies[b, 0], bodies[b, 1], bodies[b, 2], bodies[b, 3], bodies[b, 4], bodies[b, 5]
+    w0, w1, w2, v0, v1, v2 = (
+        bodies[a, 0],
+        bodies[a, 1],
+        bodies[a, 2],
+        bodies[a, 3],
+        bodies[a, 4],
+        bodies[a, 5],
+    )
+    s0, s1, s2, u0, u1, u2 = (
+        bodies[b, 0],
+        bodies[b, 1],
+        bodies[b, 2],
+        bodies[b, 3],
+        bodies[b, 4],
+        bodies[b, 5],
+    )
     dx = (u0 - v0) + (s1 * bz - s2 * by) + (w2 * ay - w1 * az)
     dy = (u1 - v1) + (s2 * bx - s0 * bz) + (w0 * az - w2 * ax)
     dz = (u2 - v2) + (s0 * by - s1 * bx) + (w1 * ax - w0 * ay)
     old = rows[k, IMPULSE]
-    new = old - (nx * dx + ny * dy + nz * dz + rows[k, COMPLIANCE] * old - rows[k, BIAS]) * rows[k, NORMAL_MASS]
+    new = (
+        old - (nx * dx + ny * dy + nz * dz + rows[k, COMPLIANCE] * old - rows[k, BIAS]) * rows[k, NORMAL_MASS]
+    )
     if new <= zero:
         if old == zero:
             return zero
