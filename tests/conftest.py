@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
+
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -18,6 +21,9 @@ from drakerock.machine.model import add_machine
 from drakerock.pile.config import RocksConfig
 from drakerock.pile.shapes import RockShape, load_rock_shapes
 from drakerock.pile.state import PileState
+
+# Piles made by tests never come from, nor go to, the user's cache.
+os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="drakerock-cache-")
 
 settings.register_profile("drakerock", deadline=None, max_examples=30, derandomize=True)
 settings.load_profile("drakerock")
@@ -71,8 +77,8 @@ def small_scenario() -> Scenario:
     return Scenario.model_validate(
         {
             "seed": 5,
-            "site": {"drift_width": 3.9, "void_depth": 0.8},
-            "pile": {"rocks": 24, "emission_reach": 1.6, "settle_speed": 0.2},
+            "site": {"drift_width": 3.9, "void_depth": 0.6},
+            "pile": {"rocks": 60, "emission_reach": 1.2, "settle_speed": 0.2},
             "loading": {"strategy": {"alpha": 0.3, "beta": 0.4, "gamma": 1.0, "kappa": 0.5}},
         }
     )

@@ -22,7 +22,18 @@ from typing import Any
 __version__ = _version("drakerock")
 
 # Imported on first use, so that `import drakerock` and `drakerock --help` stay fast.
-_LAZY: dict[str, str] = {}
+_LAZY: dict[str, str] = {
+    "DigPlanner": "drakerock.loading.planning",
+    "FeedforwardController": "drakerock.loading.control",
+    "PileSensor": "drakerock.loading.sensing",
+    "Surrogate": "drakerock.exploration.surrogate",
+    "choose_strategy": "drakerock.exploration.strategy",
+    "get_pile": "drakerock.study.jobs",
+    "load_scenario": "drakerock.loading.scenario",
+    "make_station": "drakerock.loading.station",
+    "pareto_front": "drakerock.exploration.pareto",
+    "run_cycle": "drakerock.loading.cycle",
+}
 
 __all__ = ["__version__", *_LAZY]
 

@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 from drakerock.errors import InputError, SimulationFailure
 
@@ -41,14 +42,19 @@ def main() -> None:
     try:
         app()
     except InputError as error:
-        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        _print_error("error", error)
         sys.exit(2)
     except SimulationFailure as error:
-        console.print(f"[bold red]failed:[/] {error}", highlight=False, soft_wrap=True)
+        _print_error("failed", error)
         sys.exit(1)
     except KeyboardInterrupt:
         console.print("interrupted")
         sys.exit(130)
+
+
+def _print_error(word: str, error: Exception) -> None:
+    # Text, not markup: a message may hold brackets.
+    console.print(Text(f"{word}: ", "bold red").append(str(error), "default"), soft_wrap=True)
 
 
 @app.command()
@@ -118,6 +124,49 @@ def replay(
 
     path = folder / "replay.html"
     write_replay(load_recording(folder / "recording.npz"), path)
+    _print_paths([path])
+
+
+machine_app = typer.Typer(no_args_is_help=True, help="The machine: its checks and its looks.")
+app.add_typer(machine_app, name="machine")
+
+
+@machine_app.command("check")
+def machine_check(
+    scenario: ScenarioArgument = None, set_: SetOption = None, json_: JsonOption = False
+) -> None:
+    """Measure the machine by simulation and compare it with its data.
+
+    Example: drakerock machine check studies/demo.yaml
+    """
+    from drakerock.machine.checks import make_check_data, make_check_table, run_machine_checks
+
+    with _show_progress("machine check"):
+        rows = run_machine_checks(_load(scenario, None, set_).machine)
+    if json_:
+        print(json.dumps(make_check_data(rows)))
+    else:
+        output.print(make_check_table(rows))
+    if any(row.passed is False for row in rows):
+        raise SimulationFailure(
+            "the machine misses " + ", ".join(row.name for row in rows if row.passed is False)
+        )
+
+
+@machine_app.command("show")
+def machine_show(
+    scenario: ScenarioArgument = None, out: OutOption = Path("out/machine"), set_: SetOption = None
+) -> None:
+    """Write an HTML page of the machine moving through its workspace.
+
+    Example: drakerock machine show --out out/machine
+    """
+    from drakerock.loading.cycle import make_folder
+    from drakerock.machine.page import write_machine_page
+
+    make_folder(out)
+    with _show_progress("machine show"):
+        path = write_machine_page(_load(scenario, None, set_).machine, out / "machine.html")
     _print_paths([path])
 
 
@@ -198,4 +247,4 @@ def _print_table(title: str, rows: dict[str, Any]) -> None:
 
 def _print_paths(paths: list[Path]) -> None:
     for path in paths:
-        output.print(f"wrote {path}", highlight=False, soft_wrap=True)
+        output.print(Text(f"wrote {path}"), soft_wrap=True)

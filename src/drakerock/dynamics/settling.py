@@ -7,15 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from platformdirs import user_cache_path
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.transform import Rotation
 
 import drakerock
 from drakerock.config import Config, calc_config_hash
 from drakerock.dynamics.assembly import add_plant, add_site
 from drakerock.dynamics.config import DynamicsConfig
 from drakerock.dynamics.contact_graph import find_loose
+from drakerock.dynamics.nonsmooth.engine import NonsmoothEngine
 from drakerock.dynamics.plant.rocks import add_plant_rocks, add_rock_bodies
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.pile.config import PileConfig, RocksConfig, SiteConfig
@@ -65,31 +68,62 @@ def settle(
     Raises:
         SimulationFailure: the dynamics failed.
     """
-    builder = DiagramBuilder()
-    plant, _ = add_plant(builder, recipe.dynamics)
-    add_site(plant, make_site(recipe.site), recipe.dynamics)
-    geometries = add_rock_bodies(plant, pile, shapes, recipe.rocks, recipe.dynamics)
-    plant.Finalize()
-    rocks = add_plant_rocks(builder, plant, pile, geometries)
-    diagram = builder.Build()
-    simulator = Simulator(diagram)
-    root = simulator.get_mutable_context()
-    rocks.set_pile(root, pile)
+    advance = _make_plant_advance if recipe.dynamics.rocks == "plant" else _make_nonsmooth_advance
+    advance_to = advance(pile, shapes, recipe)
     window, resting, time = recipe.pile.settle_window, False, 0.0
     before = pile
     while time < duration - 1e-9 and not (until_rest and resting):
         time = min(time + window, duration)
         try:
-            simulator.AdvanceTo(time)
+            after = advance_to(time)
         except RuntimeError as error:
             raise SimulationFailure(f"settling the pile failed at {time:.2f} s: {error}") from None
-        after = rocks.get_pile(root)
         moved = np.linalg.norm(after.p_WRs - before.p_WRs, axis=1)
         resting = bool(np.percentile(moved, 99) < recipe.pile.settle_speed * window)
         before = after
         if progress:
             progress(time / duration)
     return before, resting
+
+
+def _make_plant_advance(
+    pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe
+) -> Callable[[float], PileState]:
+    builder = DiagramBuilder()
+    plant, _ = add_plant(builder, recipe.dynamics)
+    add_site(plant, make_site(recipe.site), recipe.dynamics)
+    geometries = add_rock_bodies(plant, pile, shapes, recipe.rocks, recipe.dynamics)
+    plant.Finalize()
+    rocks = add_plant_rocks(builder, plant, pile, geometries)
+    simulator = Simulator(builder.Build())
+    root = simulator.get_mutable_context()
+    rocks.set_pile(root, pile)
+
+    def advance_to(time: float) -> PileState:
+        simulator.AdvanceTo(time)
+        return rocks.get_pile(root)
+
+    return advance_to
+
+
+def _make_nonsmooth_advance(
+    pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe
+) -> Callable[[float], PileState]:
+    engine = NonsmoothEngine(
+        recipe.rocks, shapes, make_site(recipe.site), recipe.dynamics.nonsmooth, recipe.dynamics.time_step,
+        pile.shape, pile.size, pile.fixed,
+    )  # fmt: skip
+    arrays = engine.make_arrays(pile)
+    steps = 0
+
+    def advance_to(time: float) -> PileState:
+        nonlocal arrays, steps
+        while steps < round(time / engine.time_step):
+            arrays, _ = engine.advance(arrays)
+            steps += 1
+        return engine.make_pile(arrays, pile.provenance)
+
+    return advance_to
 
 
 def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState:
@@ -104,8 +138,43 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
     shapes = load_rock_shapes(recipe.rocks.shapes)
     rng = make_generator(recipe.seed, "pile")
     waiting = sample_rocks(recipe.pile.rocks, recipe.rocks, shapes, rng)
-    total = len(waiting)
-    pile = make_empty_pile()
+    pile = drop_rocks(waiting, make_empty_pile(), shapes, recipe, rng, progress)
+    # The pile starts as a sequence leaves it after each loading: without loose rocks on the floor.
+    pile = pile.select(~find_loose(pile, shapes, recipe.pile.contact_gap))
+    provenance = {
+        "made_by": f"drakerock {drakerock.__version__}",
+        "recipe": calc_config_hash(recipe),
+        "seed": recipe.seed,
+    }
+    return replace(pile, provenance=provenance)
+
+
+def drop_rocks(
+    waiting: PileState,
+    pile: PileState,
+    shapes: tuple[RockShape, ...],
+    recipe: PileRecipe,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+) -> PileState:
+    """Emit rocks in batches from above onto a pile, and let all come to rest.
+
+    Args:
+        waiting: the rocks to emit, in this order; their turns are kept, their positions drawn.
+        pile: what is there already.
+        shapes: the rock shapes.
+        recipe: site, emission box, rest criterion, dynamics.
+        rng: source of the positions.
+        progress: called as things proceed.
+
+    Returns:
+        The pile at rest, the emitted rocks last, in the order in which they found room.
+
+    Raises:
+        InputError: the rocks do not fit under the emission height.
+        SimulationFailure: the dynamics failed, or the pile did not come to rest in time.
+    """
+    total = len(pile) + len(waiting)
     half = 0.5 * recipe.site.drift_width
     low = np.array([-recipe.pile.emission_reach, -half, 0.0])
     high = np.array([recipe.site.void_depth, half, recipe.pile.emission_height])
@@ -129,17 +198,40 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
     )
     if not resting:
         raise SimulationFailure(f"the pile did not come to rest within {recipe.pile.max_time:g} s")
-    # The pile starts as a sequence leaves it after each loading: without loose rocks on the floor.
-    pile = pile.select(~find_loose(pile, shapes, recipe.pile.contact_gap))
-    provenance = {
-        "made_by": f"drakerock {drakerock.__version__}",
-        "recipe": calc_config_hash(recipe),
-        "seed": recipe.seed,
-    }
-    return replace(pile, V_WRs=np.zeros_like(pile.V_WRs), provenance=provenance)
+    return replace(pile, V_WRs=np.zeros_like(pile.V_WRs))
 
 
-def get_pile(recipe: PileRecipe, progress: Progress | None = None) -> tuple[PileState, Path]:
+def refill(
+    pile: PileState,
+    removed: NDArray[np.bool_],
+    shapes: tuple[RockShape, ...],
+    recipe: PileRecipe,
+    rng: np.random.Generator,
+) -> PileState:
+    """Return the pile with the removed rocks emitted anew from above, so that its level is restored, at rest.
+
+    The new rocks have the removed ones' shapes and sizes, so that the gradation stays over a long sequence, and
+    new turns and places.
+
+    Args:
+        pile: all rocks, the removed ones among them.
+        removed: (n,) rocks taken away, in the bucket or as debris.
+        shapes: the rock shapes.
+        recipe: as in `drop_rocks`.
+        rng: source of the turns and places.
+
+    Raises:
+        SimulationFailure, InputError: as `drop_rocks`.
+    """
+    waiting = pile.select(removed)
+    turns = (
+        Rotation.random(len(waiting), rng=rng).as_quat(scalar_first=True) if len(waiting) else waiting.q_WRs
+    )
+    waiting = replace(waiting, q_WRs=turns, V_WRs=np.zeros((len(waiting), 6)))
+    return drop_rocks(waiting, pile.select(~removed), shapes, recipe, rng)
+
+
+def fetch_pile(recipe: PileRecipe, progress: Progress | None = None) -> tuple[PileState, Path]:
     """Return the recipe's pile and its file: the one `pile.source` names, or from the cache, or made now.
 
     Raises:

@@ -37,7 +37,8 @@ class PlanningConfig(Config):
     r_ft: Annotated[float, Field(gt=0, le=20, description="reach that scales the dig height, h_p [m]")] = 4.24
     tilt_rate: Annotated[float, Field(gt=0, le=3, description="bucket's rate on [s2, s3] [rad/s]")] = 0.5
     ramp: Annotated[
-        float, Field(gt=0, le=0.5, description="share of a segment for each smooth ramp of the speeds")
+        float,
+        Field(gt=0, le=0.5, description="share of [s1, s2] over which the speeds ramp down to the halt"),
     ] = 0.15
     wall_clearance: Annotated[float, Field(ge=0, le=2, description="machine to drift wall [m]")] = 0.15
     stop_margin: Annotated[

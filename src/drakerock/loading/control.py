@@ -154,7 +154,13 @@ class FeedforwardController(LeafSystem):
         initial[WAYPOINT_TIMES] = np.nan
         state = self.DeclareDiscreteState(initial)
         self.DeclarePeriodicDiscreteUpdateEvent(time_step, 0.0, self._update)
-        self.DeclareVectorOutputPort("motor_speeds", 3, self._calc_motor_speeds)
+        # Not of time itself: what was solved for the log at a step's end then serves the next step's update.
+        self.DeclareVectorOutputPort(
+            "motor_speeds",
+            3,
+            self._calc_motor_speeds,
+            {self._plan.ticket(), self._measurement.ticket(), self.xd_ticket()},
+        )
         self.DeclareVectorOutputPort("mode", 1, self._calc_mode, {self.discrete_state_ticket(state)})
         self.DeclareStateOutputPort("progress", state)
 

@@ -78,19 +78,16 @@ def choose_entry_slice(profile: PileProfile, gamma: float, half_room: float) -> 
     return int(ordered[round((1.0 - gamma) * (len(ordered) - 1))])
 
 
-def calc_ramp(u: Array, ramp: float, floor: float, *, up: bool, down: bool) -> Array:
-    """Return speed shares over a segment's progress u in [0, 1]: 1 with smooth ramps to `floor` at the ends."""
+def calc_halt(u: Array, ramp: float, floor: float) -> Array:
+    """Return speed shares over a segment's progress u in [0, 1]: 1, with a smooth ramp to `floor` at the end.
 
-    def calc_smooth(v: Array) -> Array:
-        v = np.clip(v, 0.0, 1.0)
-        return v * v * (3.0 - 2.0 * v)
-
-    share = np.ones_like(u)
-    if up:
-        share = np.minimum(share, floor + (1.0 - floor) * calc_smooth(u / ramp))
-    if down:
-        share = np.minimum(share, floor + (1.0 - floor) * calc_smooth((1.0 - u) / ramp))
-    return share
+    Args:
+        u: (k,) progress.
+        ramp: share of the segment that the ramp takes.
+        floor: the share of the speed that is left at the end.
+    """
+    v = np.clip((1.0 - u) / ramp, 0.0, 1.0)
+    return floor + (1.0 - floor) * v * v * (3.0 - 2.0 * v)
 
 
 def calc_swept_volume(swept: shapely.Geometry, field: HeightField, y: float, width: float) -> float:
@@ -274,19 +271,19 @@ def _make_tables(
     floor: float,
     n_lift: int,
 ) -> _Tables:
-    """Make the speeds on [s1, s2], each over its own coordinate, all three taking the same time."""
+    """Make the speeds on [s1, s2], each over its own coordinate, all three taking the same time.
+
+    All share one shape: full speed from s1, where the machine is driving already, and a smooth ramp to the halt at
+    s2. So the tip runs parallel to the slope, and the curl's integral is kept without rescaling.
+    """
     u = np.linspace(0.0, 1.0, 201)
-    drive = calc_ramp(u, config.ramp, floor, up=False, down=True)
-    turn = calc_ramp(u, config.ramp, floor, up=True, down=True)
+    drive = calc_halt(u, config.ramp, floor)
     v_z = np.tan(slope) * config.v_x_max
-    # The curl starts slowly too; its plateau makes up for that, so that the integral over the segment stays.
-    rescale = np.trapezoid(1.0 / turn, u) / np.trapezoid(1.0 / drive, u)
-    omega = rescale * psi_s2 * v_z / h_s2 if h_s2 > 0 else 0.0
-    omega = min(omega, kin.bucket_speed)
+    omega = min(psi_s2 * v_z / h_s2 if h_s2 > 0 else 0.0, kin.bucket_speed)
     return _Tables(
         SpeedTable(u * length, config.v_x_max * drive),
         SpeedTable(u * h_s2, v_z * drive),
-        SpeedTable(u * psi_s2, omega * turn),
+        SpeedTable(u * psi_s2, omega * drive),
         n_lift,
     )
 
@@ -297,7 +294,9 @@ def _integrate_lift(
     """Integrate [s1, s2] as the controller would drive it on a machine that follows exactly."""
     length, height = tables.v_x.at[-1], tables.v_z.at[-1]
     psi_end = tables.omega.at[-1]
-    dt = length / config.v_x_max / config.n_segment
+    # Fine steps, so that the three coordinates reach the waypoint together; one in eight is kept.
+    fine = 8
+    dt = length / config.v_x_max / (config.n_segment * fine)
     z0 = float(calc_tip(kin, 0.0, phi_l, phi_b)[1])
     rows = [(0.0, 0.0, 0.0, phi_l, phi_b, 0.0)]
     x = z = psi = t = 0.0
@@ -315,6 +314,7 @@ def _integrate_lift(
         psi = float(calc_pitch(kin, phi_l, phi_b))
         z = float(calc_tip(kin, 0.0, phi_l, phi_b)[1]) - z0
         rows.append((x, z, psi, phi_l, phi_b, t))
+    rows = rows[:-1:fine] + rows[-1:]
     return _Path(*np.array(rows).T)
 
 

@@ -13,7 +13,8 @@ from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
 from drakerock.dynamics.assembly import add_plant, add_site
 from drakerock.dynamics.interface import RockSystem
-from drakerock.dynamics.plant.rocks import add_plant_rocks, add_rock_bodies
+from drakerock.dynamics.nonsmooth.system import NonsmoothRocks, add_nonsmooth_rocks
+from drakerock.dynamics.plant.rocks import PlantRocks, add_plant_rocks, add_rock_bodies
 from drakerock.loading.control import FeedforwardController
 from drakerock.loading.planning import DiggingMachine, DigPlanner
 from drakerock.loading.scenario import Scenario
@@ -77,7 +78,7 @@ class MotorTargets(LeafSystem):
         self._plant, self._machine = plant, machine
         self._speeds = self.DeclareVectorInputPort("motor_speeds", 3)
         size = len(calc_motor_targets(plant, machine, 0.0, 0.0, 0.0))
-        self.DeclareVectorOutputPort("desired_state", size, self._calc)
+        self.DeclareVectorOutputPort("desired_state", size, self._calc, {self._speeds.ticket()})
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(calc_motor_targets(self._plant, self._machine, *self._speeds.Eval(context)))
@@ -101,9 +102,19 @@ def make_station(scenario: Scenario, pile: PileState) -> Station:
     plant, scene_graph = add_plant(builder, dynamics)
     add_site(plant, site, dynamics)
     machine = add_machine(plant, scenario.machine)
-    geometries = add_rock_bodies(plant, pile, shapes, scenario.rocks, dynamics)
-    plant.Finalize()
-    rocks = add_plant_rocks(builder, plant, pile, geometries)
+    rocks: PlantRocks | NonsmoothRocks
+    motor_inputs = []
+    if dynamics.rocks == "plant":
+        geometries = add_rock_bodies(plant, pile, shapes, scenario.rocks, dynamics)
+        plant.Finalize()
+        rocks = add_plant_rocks(builder, plant, pile, geometries)
+    else:
+        plant.Finalize()
+        rocks, view = add_nonsmooth_rocks(
+            builder, plant, scene_graph, machine, site, shapes, scenario.rocks, dynamics, pile
+        )
+        motor_inputs.append(view.GetInputPort("desired_state"))
+    motor_inputs.append(plant.get_desired_state_input_port(machine.instance))
 
     kinematics = make_kinematics(plant, machine)
     digger = DiggingMachine(
@@ -132,9 +143,8 @@ def make_station(scenario: Scenario, pile: PileState) -> Station:
     builder.Connect(machine_sensor.GetOutputPort("measurement"), controller.GetInputPort("measurement"))
     motors = builder.AddSystem(MotorTargets(plant, machine))
     builder.Connect(controller.GetOutputPort("motor_speeds"), motors.GetInputPort("motor_speeds"))
-    builder.Connect(
-        motors.GetOutputPort("desired_state"), plant.get_desired_state_input_port(machine.instance)
-    )
+    for port in motor_inputs:
+        builder.Connect(motors.GetOutputPort("desired_state"), port)
     hinge = add_hinge_moment(builder, plant, machine)
 
     logged = {

@@ -21,10 +21,11 @@ from pydrake.multibody.plant import (
 from pydrake.multibody.tree import RigidBody, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
+from shapely import Polygon
 
 from drakerock.machine import names
 from drakerock.machine.config import CheckConfig, MachineConfig
-from drakerock.machine.geometry import BucketGeometry, make_bucket_geometry
+from drakerock.machine.geometry import BucketGeometry, calc_area, make_bucket_geometry, read_profile
 from drakerock.machine.hinge import HingeMoment, add_hinge_moment
 from drakerock.machine.kinematics import Kinematics, make_kinematics
 from drakerock.machine.linkage import Linkage
@@ -240,14 +241,11 @@ def make_bench(
 
 
 def _add_payload(plant: MultibodyPlant, machine: Machine, mass: float) -> None:
-    bucket = plant.GetBodyByName("bucket", machine.instance)
-    points: list[Array] = []
-    while plant.HasFrameNamed(f"{names.PROFILE}{len(points)}", machine.instance):
-        frame = plant.GetFrameByName(f"{names.PROFILE}{len(points)}", machine.instance)
-        points.append(frame.GetFixedPoseInBodyFrame().translation())
-    center = np.mean(points, axis=0)
-    center[1] = 0.0
-    side = float(np.ptp(np.array(points)[:, 0]))
+    profile = read_profile(plant, machine)[:, [0, 2]]
+    center = Polygon(profile).centroid
+    side = float(np.sqrt(calc_area(profile)))
     cube = SpatialInertia.SolidBoxWithMass(mass, side, side, side)
     load = plant.AddRigidBody("payload", machine.instance, cube)
-    plant.WeldFrames(bucket.body_frame(), load.body_frame(), RigidTransform(center))
+    bucket = plant.GetBodyByName("bucket", machine.instance)
+    X_BL = RigidTransform(np.array([center.x, 0.0, center.y]))
+    plant.WeldFrames(bucket.body_frame(), load.body_frame(), X_BL)

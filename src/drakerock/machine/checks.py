@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.geometry import Box, Sphere
+from pydrake.multibody.plant import CoulombFriction
 from rich.table import Table
 
 from drakerock.machine import names
@@ -50,14 +51,11 @@ class CheckRow:
     passed: bool | None = None
 
 
-def run_machine_checks(
-    config: MachineConfig, data: MachineData | None = None, checks: CheckConfig | None = None
-) -> list[CheckRow]:
-    """Measure the machine: about half a minute of simulations.
+def run_machine_checks(config: MachineConfig, checks: CheckConfig | None = None) -> list[CheckRow]:
+    """Measure the machine by simulation (some seconds) and compare with `config.expected`.
 
     Args:
         config: the machine.
-        data: what is expected of it; the LH621's if left out.
         checks: the bench.
 
     Returns:
@@ -66,11 +64,11 @@ def run_machine_checks(
     Raises:
         InputError: the machine's SDFormat file is not usable.
     """
-    data, checks = data or MachineData(), checks or CheckConfig()
+    checks = checks or CheckConfig()
     bench = make_bench(config, checks)
-    shared = _Shared(config, data, checks, bench.kin, [])
+    shared = _Shared(config, checks, bench.kin, [])
     rows = [
-        *_check_geometry(bench, data),
+        *_check_geometry(bench, config.expected),
         *_check_balance(shared),
         *_check_traction(shared),
         *_check_breakout(shared),
@@ -106,7 +104,6 @@ class _Shared:
     """What the checks share; `records` collects every run for the checks that hold throughout."""
 
     config: MachineConfig
-    data: MachineData
     checks: CheckConfig
     kin: Kinematics
     records: list[tuple[Bench, Record]]
@@ -122,16 +119,16 @@ class _Shared:
 
 def _compare(name: str, value: float, unit: str, expected: float | None, tolerance: float) -> CheckRow:
     if expected is None:
-        return CheckRow(name, value, unit)
-    passed = abs(value - expected) <= tolerance * abs(expected)
-    return CheckRow(name, value, unit, expected, f"within {100 * tolerance:g} %", passed)
+        return CheckRow(name, float(value), unit)
+    passed = bool(abs(value - expected) <= tolerance * abs(expected))
+    return CheckRow(name, float(value), unit, float(expected), f"within {100 * tolerance:g} %", passed)
 
 
 def _bound(name: str, value: float, unit: str, limit: float) -> CheckRow:
     return CheckRow(name, value, unit, limit, "at most", bool(value <= limit))
 
 
-def _reach_floor(name: str, value: float, unit: str, limit: float) -> CheckRow:
+def _require(name: str, value: float, unit: str, limit: float) -> CheckRow:
     return CheckRow(name, value, unit, limit, "at least", bool(value >= limit))
 
 
@@ -185,6 +182,7 @@ def _check_geometry(bench: Bench, data: MachineData) -> list[CheckRow]:
         ),
         CheckRow("tip, highest (tilted, boom up)", float(top[1]), "m"),
         CheckRow("tip, dumped with the boom up", float(low[1]), "m"),
+        _require("clearance of the bucket to tyres and front unit", _calc_clearance(bench), "m", 0.0),
         _compare(
             f"r_ft on a slope of {data.reach_slope_deg:g} deg",
             calc_reach(kin, float(np.radians(data.reach_slope_deg))),
@@ -193,6 +191,23 @@ def _check_geometry(bench: Bench, data: MachineData) -> list[CheckRow]:
             0.05,
         ),
     ]
+
+
+def _calc_clearance(bench: Bench) -> float:
+    """Return the smallest distance [m] of the bucket at its stops from the front unit and its wheels."""
+    plant, kin, context = bench.plant, bench.kin, bench.plant_context
+    others = ("front_unit", *names.WHEELS[:2])
+    bucket = plant.GetCollisionGeometriesForBody(bench.get_body("bucket"))
+    chassis = [g for name in others for g in plant.GetCollisionGeometriesForBody(bench.get_body(name))]
+    distances = []
+    for phi_l in kin.phi_l_grid:
+        for phi_b in calc_bucket_range(kin, phi_l):
+            _set_angles(bench, float(phi_l), float(phi_b))
+            query = plant.get_geometry_query_input_port().Eval(context)
+            distances += [
+                query.ComputeSignedDistancePairClosestPoints(a, b).distance for a in bucket for b in chassis
+            ]
+    return float(min(distances))
 
 
 def _check_balance(shared: _Shared) -> list[CheckRow]:
@@ -232,7 +247,8 @@ def _check_traction(shared: _Shared) -> list[CheckRow]:
     wall = Obstacle(Box(size, 20.0, size), (size / 2 + 0.02, 0.0, size / 2 + 0.02), 0.0)
     bench = shared.make(obstacle=wall)
     _place(bench, x_tip=0.0, **pose)
-    record = shared.run(bench, 2.5, wheel=kin.wheel_speed)
+    # Not for long: the push lowers the boom by its motor's compliance, and a bucket on the floor takes weight.
+    record = shared.run(bench, 1.5, wheel=kin.wheel_speed)
     late = record.time > record.time[-1] - 0.5
     push = record.tyre_force[late, :, 0].sum(axis=1).mean()
     normal = record.tyre_force[late, :, 2].sum(axis=1).mean()
@@ -244,7 +260,7 @@ def _check_traction(shared: _Shared) -> list[CheckRow]:
         CheckRow(
             "traction the motors could hold", 4 * bench.machine.wheel.effort / kin.wheel_radius / 1e3, "kN"
         ),
-        _reach_floor(
+        _require(
             "wheels slip before they stall: slowest wheel", float(min(rates)), "rad/s", 0.9 * kin.wheel_speed
         ),
         _bound(
@@ -260,11 +276,10 @@ def _calc_tyre_friction(bench: Bench, checks: CheckConfig) -> float:
     wheel = bench.get_body(names.WHEELS[0])
     inspector = bench.scene_graph.model_inspector()
     geometry = bench.plant.GetCollisionGeometriesForBody(wheel)[0]
-    mu = (
-        inspector.GetProximityProperties(geometry)
-        .GetProperty("material", "coulomb_friction")
-        .dynamic_friction()
+    material: CoulombFriction = inspector.GetProximityProperties(geometry).GetProperty(  # type: ignore[assignment]
+        "material", "coulomb_friction"
     )
+    mu = material.dynamic_friction()
     return float(2 * mu * checks.floor_friction / (mu + checks.floor_friction))
 
 
@@ -275,7 +290,11 @@ def _check_breakout(shared: _Shared) -> list[CheckRow]:
     held, free = (_measure_breakout(shared, hold_chassis) for hold_chassis in (True, False))
     return [
         _compare(
-            "breakout force, chassis held", held / 1e3, "kN", _scale(shared.data.breakout_force, 1e-3), 0.05
+            "breakout force, chassis held",
+            held / 1e3,
+            "kN",
+            _scale(shared.config.expected.breakout_force, 1e-3),
+            0.05,
         ),
         CheckRow("breakout force, chassis free", free / 1e3, "kN"),
     ]
@@ -304,7 +323,7 @@ def _scale(value: float | None, factor: float) -> float | None:
 
 def _check_lift(shared: _Shared) -> list[CheckRow]:
     kin = shared.kin
-    bench = shared.make(payload=shared.data.payload)
+    bench = shared.make(payload=shared.config.expected.payload)
     phi_l = float(calc_joint_angles(kin, 0.0, 0.0)[0])
     psi = float(calc_full_tilt(kin, phi_l)) - 2 * _MARGIN
     z_tip = float(calc_tip(kin, 0.0, phi_l, kin.phi_level - phi_l - psi)[1])
@@ -320,13 +339,13 @@ def _check_lift(shared: _Shared) -> list[CheckRow]:
     rear = record.tyre_force[moving, 2:, 2].sum(axis=1).min()
     return [
         _bound(
-            f"boom lifts {shared.data.payload / 1e3:g} t: angle reached",
+            f"boom lifts {shared.config.expected.payload / 1e3:g} t: angle reached",
             float(np.degrees(angles.min())),
             "deg",
             float(np.degrees(kin.phi_l_range[0] + _MARGIN)),
         ),
         _bound("largest boom torque on the way", float(boom) / 1e3, "kNm", bench.machine.boom.effort / 1e3),
-        _reach_floor("smallest load of the rear axle on the way", float(rear) / 1e3, "kN", 0.0),
+        _require("smallest load of the rear axle on the way", float(rear) / 1e3, "kN", 0.0),
     ]
 
 
@@ -379,7 +398,7 @@ def _check_hinge(shared: _Shared) -> list[CheckRow]:
     _set_angles(bench, *angles)
     p_BQ = np.array([*bench.bucket.profile[0], bench.bucket.outer_width / 2])[[0, 2, 1]]
     R_WB = bench.get_body("bucket").EvalPoseInWorld(bench.plant_context).rotation()
-    weight = 9.81 * shared.data.payload
+    weight = 9.81 * shared.config.expected.payload
     force = weight * np.array([-0.5, 0.2, 0.7])
     bench.apply_force("bucket", p_BQ, force)
     record = shared.run(bench, 0.3)
@@ -404,14 +423,14 @@ def _check_corner(shared: _Shared) -> list[CheckRow]:
     size = 2 * kin.bucket_length
     # A post in the way of the bucket's left corner, a fifth of the half width inwards.
     post = Obstacle(
-        Box(size, half, size), (size / 2 + 0.02, 1.3 * half, size / 2 + 0.02), shared.checks.floor_friction
+        Box(size, half, size), (size / 2 + 0.001, 1.3 * half, size / 2 + 0.02), shared.checks.floor_friction
     )
     bench = shared.make(obstacle=post)
     _place(bench, x_tip=0.0, **_calc_carry_pose(kin))
     record = shared.run(bench, 2.0, wheel=kin.wheel_speed)
     moment = np.linalg.norm(record.moment, axis=1) / 1e3
     late = record.time > record.time[-1] - 1.0
-    expected = _scale(shared.data.critical_moment, 1e-3)
+    expected = _scale(shared.config.expected.critical_moment, 1e-3)
     rule = "for comparison"
     return [
         CheckRow(
@@ -438,7 +457,7 @@ def _check_free_flight(shared: _Shared) -> list[CheckRow]:
             bench,
             duration,
             boom=-0.5 * kin.boom_speed,
-            bucket=0.8 * kin.bucket_speed,
+            bucket=-0.8 * kin.bucket_speed,
             wheel=0.5 * kin.wheel_speed,
         )
         momentum_1, spin_1, energy_1 = _measure_motion(bench)
@@ -463,7 +482,7 @@ def _check_free_flight(shared: _Shared) -> list[CheckRow]:
                 "angular momentum afloat: error",
                 100 * float(np.linalg.norm(spin_1)) / (moved * reach),
                 "% of moved",
-                0.1,
+                0.5,
             ),
             _bound(
                 "energy less the motors' work: error",

@@ -16,24 +16,6 @@ class MotorConfig(Config):
     )
 
 
-class MachineConfig(Config):
-    """Which machine, and what differs from its SDFormat file."""
-
-    model: str = Field(
-        default="package://drakerock/lhd/lhd.sdf",
-        description="the SDFormat file: a path, or package://drakerock/...",
-    )
-    wheel: MotorConfig = MotorConfig()
-    boom: MotorConfig = MotorConfig()
-    bucket: MotorConfig = MotorConfig()
-    motor_damping: float | None = Field(
-        default=None, gt=0, description="velocity gain of the three motors [N m s/rad]; none: as in the file"
-    )
-    steering_angle_deg: float = Field(
-        default=0.0, ge=-45, le=45, description="angle held at the articulation, positive turns left [deg]"
-    )
-
-
 class MachineData(Config):
     """What `run_machine_checks` expects of the machine; none: the value is reported without judgement."""
 
@@ -50,6 +32,25 @@ class MachineData(Config):
     critical_moment: float | None = Field(
         default=145e3, gt=0, description="tau_c of the damage measure, for comparison only [N m]"
     )
+
+
+class MachineConfig(Config):
+    """Which machine, and what differs from its SDFormat file."""
+
+    model: str = Field(
+        default="package://drakerock/lhd/lhd.sdf",
+        description="the SDFormat file: a path, or package://drakerock/...",
+    )
+    wheel: MotorConfig = MotorConfig()
+    boom: MotorConfig = MotorConfig()
+    bucket: MotorConfig = MotorConfig()
+    motor_damping: float | None = Field(
+        default=None, gt=0, description="velocity gain of the three motors [N m s/rad]; none: as in the file"
+    )
+    steering_angle_deg: float = Field(
+        default=0.0, ge=-45, le=45, description="angle held at the articulation, positive turns left [deg]"
+    )
+    expected: MachineData = MachineData()
 
 
 class CheckConfig(Config):

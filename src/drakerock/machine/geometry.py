@@ -55,13 +55,7 @@ class CollisionPiece:
 
 def make_bucket_geometry(plant: MultibodyPlant, scene_graph: SceneGraph, machine: Machine) -> BucketGeometry:
     """Read the bucket's geometry off the finalized plant."""
-    context = plant.CreateDefaultContext()
-    bucket = plant.GetFrameByName("bucket", machine.instance)
-    points: list[Array] = []
-    while plant.HasFrameNamed(f"{names.PROFILE}{len(points)}", machine.instance):
-        frame = plant.GetFrameByName(f"{names.PROFILE}{len(points)}", machine.instance)
-        points.append(frame.CalcPose(context, bucket).translation())
-    corners = np.array(points)
+    corners = read_profile(plant, machine)
     profile = corners[:, [0, 2]]
     # Loose rock stands at about 45 degrees at most: a heap's height is half of the strike line's length.
     strike = profile[-1] - profile[0]
@@ -73,6 +67,15 @@ def make_bucket_geometry(plant: MultibodyPlant, scene_graph: SceneGraph, machine
         inner_width=float(2 * np.abs(corners[:, 1]).min()),
         outer_width=float(np.ptp(np.vstack([piece.vertices for piece in pieces])[:, 1])),
     )
+
+
+def read_profile(plant: MultibodyPlant, machine: Machine) -> Array:
+    """Return (k, 3): the corners of the bucket's inside in side view, in B [m], on the left side plate."""
+    points: list[Array] = []
+    while plant.HasFrameNamed(f"{names.PROFILE}{len(points)}", machine.instance):
+        frame = plant.GetFrameByName(f"{names.PROFILE}{len(points)}", machine.instance)
+        points.append(frame.GetFixedPoseInBodyFrame().translation())
+    return np.array(points)
 
 
 def calc_area(polygon: Array) -> float:

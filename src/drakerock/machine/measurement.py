@@ -63,7 +63,9 @@ class MachineSensor(LeafSystem):
             "body_spatial_velocities", Value([SpatialVelocity()])
         )
         self._state = self.DeclareVectorInputPort("machine_state", plant.num_multibody_states(instance))
-        self.DeclareVectorOutputPort("measurement", len(MEASUREMENT), self._calc_measurement)
+        self.DeclareVectorOutputPort(
+            "measurement", len(MEASUREMENT), self._calc_measurement, {self.all_input_ports_ticket()}
+        )
 
     def _calc_measurement(self, context: Context, output: BasicVector) -> None:
         poses = self._poses.Eval(context)

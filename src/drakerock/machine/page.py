@@ -55,7 +55,7 @@ def write_machine_page(config: MachineConfig, path: str | Path, *, contact_shape
 
     front = plant.GetBodyByName("front_unit", machine.instance)
     wheels = [plant.GetJointByName(joint, machine.instance) for joint in names.WHEEL_JOINTS]
-    eye = 3 * (kin.boom_length + kin.bucket_length)
+    eye = 2.2 * (kin.boom_length + kin.bucket_length)
     meshcat.SetCameraPose(
         np.array([0.65 * eye, 0.6 * eye, 0.35 * eye]), np.array([-0.1 * eye, 0.0, 0.08 * eye])
     )
@@ -79,7 +79,7 @@ def write_machine_page(config: MachineConfig, path: str | Path, *, contact_shape
 
 
 def _make_tour(kin: Kinematics) -> Array:
-    """Return rows (x of the front axle, phi_l, phi_b): forward, then round the border of the workspace, back."""
+    """Return rows (x of the front axle, phi_l, phi_b): forward, round the workspace's border, back."""
     inset = 1e-3
     level_l, level_b = (float(angle) for angle in calc_joint_angles(kin, 0.0, 0.0))
     top, bottom = kin.phi_l_range[0] + inset, kin.phi_l_range[1] - inset

@@ -7,25 +7,24 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from drakerock.dynamics.settling import PileRecipe, get_pile
+from drakerock.dynamics.settling import fetch_pile
 from drakerock.loading.cycle import CycleOutcome, make_folder, run_cycle, save_cycle, write_text
-from drakerock.loading.scenario import Scenario
+from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.pile.shapes import load_rock_shapes
-from drakerock.pile.state import save_pile
+from drakerock.pile.state import PileState, save_pile
 from drakerock.pile.summary import calc_summary
 from drakerock.viewing.pile_figures import write_pile_picture
 from drakerock.viewing.replay import write_replay
 
 
-def make_recipe(scenario: Scenario) -> PileRecipe:
-    """Return what the scenario's pile depends on."""
-    return PileRecipe(
-        seed=scenario.seed,
-        site=scenario.site,
-        rocks=scenario.rocks,
-        pile=scenario.pile,
-        dynamics=scenario.dynamics,
-    )
+def get_pile(scenario: Scenario, progress: Callable[..., None] | None = None) -> PileState:
+    """Return the scenario's pile: the file it names, or from the cache, or made now.
+
+    Raises:
+        InputError: an unreadable pile file, or a pile that cannot be made so.
+        SimulationFailure: the pile did not come to rest.
+    """
+    return fetch_pile(make_recipe(scenario), progress)[0]
 
 
 def run_and_save(
@@ -43,7 +42,7 @@ def run_and_save(
         SimulationFailure: the pile could not be made.
     """
     make_folder(folder)
-    pile, _ = get_pile(make_recipe(scenario), progress)
+    pile = get_pile(scenario, progress)
     result = run_cycle(
         scenario, pile, lambda mode, time: progress(mode.lower(), None, note=f"{time:.1f} s simulated")
     )
@@ -68,7 +67,7 @@ def make_pile_files(
         SimulationFailure: the pile could not be made.
     """
     make_folder(folder)
-    pile, source = get_pile(make_recipe(scenario), progress)
+    pile, source = fetch_pile(make_recipe(scenario), progress)
     shapes = load_rock_shapes(scenario.rocks.shapes)
     summary = calc_summary(pile, shapes, scenario.rocks) | {"taken_from": str(source)}
     paths = [folder / "pile.npz", folder / "pile.json", folder / "pile.png"]

@@ -1,0 +1,186 @@
+"""The real command, as a user runs it."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import yaml
+
+from drakerock.loading.plan import DigPlan
+from drakerock.pile.state import load_pile
+
+COMMAND = Path(sys.executable).with_name("drakerock")
+
+
+def run(*args, cwd, **kwargs):
+    environment = os.environ | {
+        "XDG_CACHE_HOME": str(cwd / "cache"),
+        "COLUMNS": "200",
+        "OMP_NUM_THREADS": "1",
+    }
+    return subprocess.run(
+        [str(COMMAND), *map(str, args)],
+        cwd=cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        **kwargs,
+    )
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory, small_scenario):
+    folder = tmp_path_factory.mktemp("cli")
+    (folder / "small.yaml").write_text(yaml.safe_dump(small_scenario.model_dump(mode="json")))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def loaded(place):
+    return run("load", "small.yaml", "--out", "out", "--alpha", "0.4", cwd=place)
+
+
+def test_load_writes_everything_it_says(place, loaded):
+    assert loaded.returncode == 0, loaded.stderr
+    out = place / "out"
+    names = [
+        "outcome.json",
+        "signals.parquet",
+        "pile_before.npz",
+        "pile_after.npz",
+        "recording.npz",
+        "replay.html",
+    ]
+    for name in names:
+        assert (out / name).stat().st_size > 0
+        assert f"wrote out/{name}" in loaded.stdout
+    assert "production" in loaded.stdout
+    outcome = json.loads((out / "outcome.json").read_text())
+    assert outcome["status"] == "done"
+    assert outcome["reason"] in ("s4 reached", "s4 timed out")
+    assert outcome["strategy"]["alpha"] == 0.4
+    assert outcome["phi1"] == -outcome["objectives"]["production"]
+    assert outcome["phi1"] == pytest.approx(-outcome["bucket_mass_kg"] / outcome["loading_time_s"])
+    assert set(outcome["rocks"]) == {"total", "awake_max", "awake_mean"}
+    assert np.all(np.diff(outcome["waypoint_times_s"]) >= 0)
+    assert {"drakerock", "drake"} <= set(outcome["versions"])
+
+
+def test_signals_have_units_and_obey_the_limits(place, loaded):
+    table = pq.read_table(place / "out" / "signals.parquet")
+    assert all(field.metadata[b"unit"] for field in table.schema)
+    columns = {name: np.array(table[name]) for name in table.column_names}
+    assert np.all(np.isfinite(np.column_stack(list(columns.values()))))
+    assert np.allclose(np.diff(columns["time"]), 0.01)
+    assert np.abs(columns["torque_wheels"]).max() <= 4 * 190e3 * (1 + 1e-9)
+    assert np.abs(columns["torque_boom"]).max() <= 2000e3 * (1 + 1e-9)
+    assert np.abs(columns["torque_bucket"]).max() <= 800e3 * (1 + 1e-9)
+    # Nothing is prescribed: before the rocks the machine is at the planned speed, by its wheels' grip.
+    free = (columns["mode"] == 0) & (columns["time"] > 0.6)
+    assert np.allclose(columns["v_F"][free], 1.3, atol=0.05)
+    # The first row is of the machine in its place.
+    assert abs(columns["x_T"][1] - columns["x_T"][0]) < 0.05
+
+
+def test_pile_after_has_the_same_rocks_and_the_plan_is_readable(place, loaded):
+    before, after = (load_pile(place / "out" / f"pile_{when}.npz") for when in ("before", "after"))
+    assert np.array_equal(before.size, after.size)
+    assert np.linalg.norm(after.p_WRs - before.p_WRs, axis=1).max() > 0.3
+    assert after.p_WRs[:, 2].min() > 0.0
+    data = json.loads((place / "out" / "plan.json").read_text())
+    plan = DigPlan.from_dict(data)
+    assert plan.waypoint_x[4] < plan.waypoint_x[0]
+
+
+def test_replay_opens_without_network_and_can_be_made_anew(place, loaded):
+    path = place / "out" / "replay.html"
+    text = path.read_text()
+    assert "<html" in text.lower()
+    assert not re.search(r"<(script|link|img|iframe)[^>]*(src|href)\s*=\s*[\"']?(https?:)?//", text)
+    path.unlink()
+    again = run("replay", "out", cwd=place)
+    assert again.returncode == 0, again.stderr
+    assert path.stat().st_size > 100_000
+
+
+def test_json_prints_only_json_and_the_same_cycle_again(place, loaded):
+    again = run("load", "small.yaml", "--out", "again", "--alpha", "0.4", "--json", cwd=place)
+    assert again.returncode == 0, again.stderr
+    outcome = json.loads(again.stdout)
+    first = json.loads((place / "out" / "outcome.json").read_text())
+    for key in ("wall_time_s", "ms_per_step"):
+        outcome.pop(key)
+        first.pop(key)
+    assert outcome == first
+    one, two = (load_pile(place / name / "pile_after.npz") for name in ("out", "again"))
+    assert np.array_equal(one.p_WRs, two.p_WRs)  # bit for bit
+    assert np.array_equal(one.q_WRs, two.q_WRs)
+
+
+def test_pile_command(place, loaded):
+    result = run("pile", "small.yaml", "--out", "pile", "--json", cwd=place)
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["rocks"] <= 60
+    for name in ("pile.npz", "pile.json", "pile.png"):
+        assert (place / "pile" / name).stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("args", "parts"),
+    [
+        (["load", "nothing.yaml"], ["nothing.yaml", "no such file"]),
+        (["load", "bad.yaml"], ["bad.yaml:2", "site.drift_widht", "did you mean 'drift_width'?"]),
+        (
+            ["load", "small.yaml", "--alpha", "5"],
+            ["--set", "loading.strategy.alpha", "less than or equal to 2"],
+        ),
+        (
+            ["load", "small.yaml", "--set", "machine.model=nothing.sdf"],
+            ["machine.model", "nothing.sdf", "no such file"],
+        ),
+        (["load", "small.yaml", "--set", "machine.model=broken.sdf"], ["machine.model", "broken.sdf"]),
+        (["load", "small.yaml", "--set", "pile.source=nothing.npz"], ["nothing.npz", "no such file"]),
+        (["load", "small.yaml", "--set", "pile.source=broken.npz"], ["broken.npz", "not a readable"]),
+        (["load", "small.yaml", "--set", "rocks.shapes=[broken.sdf]"], ["rocks.shapes", "broken.sdf"]),
+        (["load", "small.yaml", "--out", "small.yaml/x"], ["small.yaml/x", "cannot be written"]),
+        (["pile", "small.yaml", "--set", "pile.emission_height=0.3"], ["pile.rocks", "emission_height"]),
+        (["replay", "nowhere"], ["nowhere", "no such file"]),
+        (["machine", "check", "bad.yaml"], ["bad.yaml:2", "drift_widht"]),
+    ],
+)
+def test_bad_input_gets_one_message_and_exit_code_two(place, args, parts):
+    (place / "bad.yaml").write_text("site:\n  drift_widht: 5\n")
+    (place / "broken.sdf").write_text("<sdf><model>")
+    (place / "broken.npz").write_bytes(b"PK\x03\x04 broken")
+    result = run(*args, cwd=place)
+    assert result.returncode == 2, result.stderr + result.stdout
+    assert "Traceback" not in result.stderr + result.stdout
+    message = result.stderr.replace("\n", " ")
+    for part in parts:
+        assert part in message, message
+
+
+def test_every_command_has_help_with_an_example(place):
+    for command in (["load"], ["pile"], ["replay"], ["machine", "check"], ["machine", "show"]):
+        result = run(*command, "--help", cwd=place)
+        assert result.returncode == 0
+        assert "Example: drakerock " + " ".join(command) in result.stdout
+
+
+def test_empty_drift_ends_with_its_reason(place):
+    # All rocks behind the brow: nothing to be seen, nothing to be dug.
+    result = run(
+        "load", "small.yaml", "--out", "none", "--json", "--set", "pile.emission_reach=0", "--set", "site.void_depth=6",
+        "--set", "pile.rocks=3", cwd=place,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    outcome = json.loads(result.stdout)
+    assert outcome["reason"].startswith("no candidate slice")
+    assert outcome["objectives"]["production"] == 0.0
