@@ -1,7 +1,7 @@
 """Cost and quality of the nonsmooth rock engine at full size, one core.
 
     OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python benchmarks/rocks.py all
-    ... benchmarks/rocks.py awake resting quality shallow deep shallow-none deep-none scaling
+    ... benchmarks/rocks.py awake resting quality woken shallow deep shallow-none deep-none scaling
 
 The pile (about 5 500 moving rocks in a drift of 6.5 m) is filled on first use, kept in the user's cache folder.
 """
@@ -122,6 +122,21 @@ def bench_resting(pile: PileState) -> None:
         print(f"resting: {reports[-1].n_awake} awake of {len(pile)}: {median * 1e3:.2f} ms per step")
 
 
+def bench_woken(pile: PileState) -> None:
+    """300 rocks woken inside the stored pile, 5 s without a machine."""
+    resting = np.ones(len(pile), bool)
+    chosen = np.argsort(np.linalg.norm(pile.p_WRs - [1.5, 0.0, 2.0], axis=1))[:300]
+    resting[chosen] = False
+    start = replace(pile, contacts=replace(pile.contacts, resting=resting), V_WRs=np.zeros((len(pile), 6)))
+    after, _, reports = time_steps(make_engine(start), start, 500)
+    moved = np.linalg.norm(after.p_WRs - start.p_WRs, axis=1)
+    print(
+        f"woken: of 300 rocks, mean displacement {moved[chosen].mean() * 1e3:.2f} mm, "
+        f"p99 {np.percentile(moved[chosen], 99) * 1e3:.2f} mm; at most {max(r.n_awake for r in reports)} awake, "
+        f"in the end {reports[-1].n_awake}"
+    )
+
+
 def bench_quality(pile: PileState) -> None:
     """At rest with all awake: speed, penetration, creep."""
     engine = make_engine(pile, reduction="none")
@@ -145,7 +160,7 @@ def bench_quality(pile: PileState) -> None:
 Rates = Callable[[float], tuple[float, float, float]]
 
 
-class _Motors(LeafSystem):
+class Motors(LeafSystem):
     def __init__(self, machine_rates: Callable[[float], np.ndarray], size: int) -> None:
         super().__init__()
         self._rates = machine_rates
@@ -206,7 +221,7 @@ def build_dig(
         builder, plant, scene_graph, machine, built, SHAPES, ROCKS, dynamics, pile
     )
     size = len(calc_motor_targets(plant, machine, 0.0, 0.0, 0.0))
-    motors = builder.AddSystem(_Motors(lambda t: calc_motor_targets(plant, machine, *rates(t)), size))
+    motors = builder.AddSystem(Motors(lambda t: calc_motor_targets(plant, machine, *rates(t)), size))
     for port in (plant.get_desired_state_input_port(machine.instance), view.GetInputPort("desired_state")):
         builder.Connect(motors.GetOutputPort("desired_state"), port)
     simulator = Simulator(builder.Build())
@@ -300,6 +315,7 @@ CASES: dict[str, Callable[[PileState], None]] = {
     "awake": bench_awake,
     "resting": bench_resting,
     "quality": bench_quality,
+    "woken": bench_woken,
     "shallow": lambda pile: bench_dig(pile, 1.0, "rest"),
     "deep": lambda pile: bench_dig(pile, 3.5, "rest"),
     "shallow-none": lambda pile: bench_dig(pile, 1.0, "none"),
