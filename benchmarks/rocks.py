@@ -21,6 +21,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
 from drakerock.dynamics.assembly import add_plant, add_site
 from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
+from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.nonsmooth.engine import NonsmoothEngine
 from drakerock.dynamics.nonsmooth.system import NonsmoothRocks, add_nonsmooth_rocks
 from drakerock.machine.config import MachineConfig
@@ -247,7 +248,7 @@ def run_dig(
     n_steps = round(duration / time_step)
     tip = plant.GetFrameByName("tip")
     start = tip.CalcPoseInWorld(plant_context).translation()[0]
-    forces, summaries, reach = np.zeros((n_steps, 6)), np.zeros((n_steps, 6)), np.zeros(n_steps)
+    forces, summaries, reach = np.zeros((n_steps, 6)), np.zeros((n_steps, len(ROCK_SUMMARY))), np.zeros(n_steps)
     fastest = 0.0
     cpu = time.process_time()
     for k in range(n_steps):
@@ -286,6 +287,7 @@ def run_dig(
         "residual_max": float(summaries[:, 4].max()),
         "fastest_m_s": fastest,
         "lost": float(summaries[-1, 5]),
+        "flagged": float(summaries[-1, 6]),
     }
 
 

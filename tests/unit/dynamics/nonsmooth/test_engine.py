@@ -251,6 +251,7 @@ def test_a_step_that_does_not_converge_is_redone():
     engine = make_engine(pile, [make_box(0.8, 0.8, 0.5)], config=config)
     _, report = engine.advance(engine.make_arrays(pile))
     assert report.redone
+    assert report.flagged
 
 
 def test_deep_overlap_recovers_slowly():
@@ -258,11 +259,14 @@ def test_deep_overlap_recovers_slowly():
     engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)], gravity=0.0)
     arrays = engine.make_arrays(pile)
     fastest = 0.0
+    arrays, report = engine.advance(arrays)
+    assert report.flagged
     for _ in range(200):
         arrays, report = engine.advance(arrays)
         fastest = max(fastest, np.abs(arrays.velocities[:, 3:]).max())
     assert fastest <= engine.config.max_recovery_speed
     assert report.max_penetration < 1e-3
+    assert not report.flagged
 
 
 @settings(max_examples=50, deadline=None)
