@@ -107,9 +107,8 @@ def bench_awake(pile: PileState) -> None:
         )
 
 
-def bench_resting(pile: PileState) -> None:
+def bench_resting(pile: PileState, site: SiteConfig = SITE) -> None:
     """300 rocks awake among resting ones; and none awake."""
-    engine = make_engine(pile)
     resting = replace(pile.contacts, resting=np.ones(len(pile), bool))
     for n_awake in (0, 300, 800, 2000):
         flags = resting.resting.copy()
@@ -118,7 +117,7 @@ def bench_resting(pile: PileState) -> None:
         flags[middle[:n_awake]] = False
         start = replace(pile, contacts=replace(resting, resting=flags), V_WRs=np.zeros((len(pile), 6)))
         # the count is held: neither waking nor resting
-        engine = make_engine(pile, rest={"wake_load": 1e9, "time": 1e9})
+        engine = make_engine(pile, site, rest={"wake_load": 1e9, "time": 1e9})
         _, median, reports = time_steps(engine, start, 100)
         print(f"resting: {reports[-1].n_awake} awake of {len(pile)}: {median * 1e3:.2f} ms per step")
 
@@ -312,10 +311,15 @@ def bench_scaling(pile: PileState) -> None:
     site = SITE.model_copy(update={"void_depth": SITE.void_depth + n_blocks * width})
     # They lean on each other now instead of on a wall.
     engine = make_engine(total, site)
+    bench_resting(total, site)
     arrays = engine.make_arrays(total)
-    for _ in range(300):
+    for k in range(6000):
         arrays, report = engine.advance(arrays)
-    print(f"scaling: {len(total)} rocks, {report.n_awake} awake after 3 s without a machine")
+        if k > 100 and report.n_awake < 0.01 * len(total):
+            break
+    print(
+        f"scaling: {len(total)} rocks, {report.n_awake} awake after {k * TIME_STEP:.0f} s without a machine"
+    )
     total = engine.make_pile(arrays)
     for rocks, where in ((pile, SITE), (total, site)):
         result = run_dig(rocks, make_dig(1.0), NonsmoothConfig(), site=where)

@@ -194,8 +194,10 @@ def test_the_solve_foresees_the_plants_motion(jammed):
                 scene.plant.SetVelocities(other, v)
                 velocity.append(scene.plant.EvalBodySpatialVelocityInWorld(other, bucket).translational())
             errors.append(np.linalg.norm(velocity[0] - velocity[1]))
-    assert np.median(errors) < 0.02
-    assert np.max(errors) < 0.2
+    # Closely while it drives into the first rocks; less so in the jam, with saturated motors and sliding tyres.
+    assert np.median(errors[:20]) < 2e-3
+    assert np.median(errors) < 0.06
+    assert np.max(errors) < 0.3
 
 
 def test_a_restored_context_repeats_bit_for_bit(jammed):

@@ -44,25 +44,46 @@ def _hash(key: int, mask: int) -> int:
 
 
 @kernel
-def index_memory(memory: Array, n_memory: int, table: Array) -> None:
+def _is_idle(key: int, n_rocks: int, status: Array) -> bool:
+    """Return whether neither of a pair is awake: it is not searched, its points stay as they are."""
+    a, b = key // KEY_STEP, key % KEY_STEP
+    return status[a] != 0 and (b >= n_rocks or status[b] != 0)
+
+
+@kernel
+def index_memory(memory: Array, n_memory: int, n_rocks: int, status: Array, table: Array) -> int:
     """Set a hash table from a pair's key to the first of its rows in memory (rows of a pair are in line).
 
     Args:
         memory: (.., MEMORY_WIDTH).
         n_memory: number of rows.
-        table: (2**k,) set; -1 where empty; must have more places than pairs.
+        n_rocks: number of rocks.
+        status: (n,) of each rock, see `broad_phase`; pairs without an awake rock are left out.
+        table: (2**k,) at least twice as many places as rows; as many of the first as needed are set, -1 where
+            empty.
+
+    Returns:
+        how many places are in use: a power of two; look up in ``table[:places]``.
     """
-    table[:] = -1
-    mask = len(table) - 1
+    n_used = 0
+    for row in range(n_memory):
+        if not _is_idle(int(memory[row, MEMORY_KEY]), n_rocks, status):
+            n_used += 1
+    places = 64
+    while places < 2 * n_used:
+        places *= 2
+    table[:places] = -1
+    mask = places - 1
     last = -1
     for row in range(n_memory):
         key = int(memory[row, MEMORY_KEY])
-        if key != last:
+        if key != last and not _is_idle(key, n_rocks, status):
             place = _hash(key, mask)
             while table[place] >= 0:
                 place = (place + 1) & mask
             table[place] = row
-            last = key
+        last = key
+    return places
 
 
 @kernel
@@ -114,9 +135,9 @@ def write_memory(
     n_new = 0
     for row in range(n_old):
         key = int(old[row, MEMORY_KEY])
-        a, b = key // KEY_STEP, key % KEY_STEP
-        if status[a] == 0 or (b < n_rocks and status[b] == 0):
+        if not _is_idle(key, n_rocks, status):
             continue
+        a, b = key // KEY_STEP, key % KEY_STEP
         if status[a] == 3 or (b < n_rocks and status[b] == 3):
             continue
         if n_new < len(new):

@@ -432,8 +432,8 @@ class NonsmoothEngine:
         motion.set_bodies(awake, arrays.velocities, self.inverse_mass, self._inverse_inertia, self._bodies)
 
         n_pairs = self._find_pairs(status, awake)
-        contacts.index_memory(memory, arrays.n_memory, self._table)
-        n_rows = self._find_contacts(n_pairs, memory)
+        places = contacts.index_memory(memory, arrays.n_memory, n, status, self._table)
+        n_rows = self._find_contacts(n_pairs, memory, self._table[:places])
         rows, body_a, body_b = self._rows, self._body_a, self._body_b
         if not warm:
             rows[:n_rows, contacts.IMPULSE : contacts.IMPULSE + 3] = 0.0
@@ -454,7 +454,7 @@ class NonsmoothEngine:
         motion.add_gravity(awake, self._bodies, np.array([0.0, 0.0, -self.gravity * dt]))
         velocity += machine.free_change
         residual = solver.solve_resting(
-            rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, iterations,
+            rows, n_rows, body_a, body_b, awake, self._bodies, n, machine.arrays, velocity, iterations,
             self._packed, self._packed_index, self._bodies_32,
         )  # fmt: skip
 
@@ -476,18 +476,23 @@ class NonsmoothEngine:
             new.velocities,
         )
         if not sane or not np.isfinite(velocity).all():
+            # The rows of bodies that are not awake have to stay zero.
+            self._bodies[:] = 0.0
+            self._bodies_32[:] = 0.0
             return None, None
         n_memory = contacts.write_memory(
             n, status, memory, arrays.n_memory, rows, n_rows, self._row_key, self._row_rock, self._rotations,
             new.memory,
         )  # fmt: skip
         new.n_memory = min(n_memory, self.capacity)
-        contacts.sum_impulses(new.memory, new.n_memory, n, self._sums)
         n_rested, n_lost = reduction.rest(
-            book, new.positions, new.velocities, self.radius, self._sums, machine.sensors, dt,
+            book, new.positions, new.velocities, self.radius, machine.sensors, dt,
             config.rest.displacement, config.rest.time, config.rest.speed, self._lower_site, self._upper_site,
             config.reduction == "rest",
         )  # fmt: skip
+        if n_rested > 0:
+            contacts.sum_impulses(new.memory, new.n_memory, n, self._sums)
+            reduction.set_references(book, self._sums)
         loaded = rows[:n_rows, contacts.IMPULSE] > 0.0
         depths = -rows[:n_rows, contacts.GAP][loaded]
         max_penetration = float(depths.max(initial=0.0))
@@ -578,14 +583,14 @@ class NonsmoothEngine:
             )
         )  # fmt: skip
 
-    def _find_contacts(self, n_pairs: int, memory: Array) -> int:
+    def _find_contacts(self, n_pairs: int, memory: Array, table: IntArray) -> int:
         config = self.config
         while True:
             n_rows = narrow_phase.find_contacts(
                 self._pair_a, self._pair_b, n_pairs, self.n_rocks, self.first_plane, self.first_piece,
                 self.planes, self.convex, self.shape, self.scale, self._positions, self._rotations,
                 self._velocities, self.solver_body, self.friction, self.restitution, self.time_step,
-                config.contact_margin, config.manifold_gap, config.face_cosine, memory, self._table,
+                config.contact_margin, config.manifold_gap, config.face_cosine, memory, table,
                 self._axis_keys, self._axes, self._rows, self._body_a, self._body_b, self._row_key,
                 self._row_rock, self._statistics,
             )  # fmt: skip

@@ -66,9 +66,8 @@ def set_bodies(
         velocities: (n, 6) angular, translational, in W.
         inverse_mass: (n,) [1/kg].
         inverse_inertia: (n, 6) in W's axes.
-        bodies: (n + 1, BODY_WIDTH) set.
+        bodies: (n + 1, BODY_WIDTH) set; zero before.
     """
-    bodies[:] = 0.0
     for s in range(len(awake)):
         i = awake[s]
         for d in range(6):
@@ -102,7 +101,7 @@ def move(
 
     Args:
         awake: (m,) rocks.
-        bodies: (n + 1, BODY_WIDTH) after the solve.
+        bodies: (n + 1, BODY_WIDTH) after the solve; set to zero.
         inverse_inertia_local: (n, 6) in the rocks' frames.
         time_step: [s].
         quaternions, positions, velocities: (n, 4), (n, 3), (n, 6) changed.
@@ -140,6 +139,7 @@ def move(
         total = qw + qx + qy + qz
         for d in range(3):
             total += positions[i, d] + velocities[i, d] + velocities[i, 3 + d]
+        bodies[i] = 0.0
         # Not math.isfinite: with sums reordered it is compiled to True.
         if not abs(total) < HUGE:
             sane = False

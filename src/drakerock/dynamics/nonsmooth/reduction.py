@@ -18,6 +18,9 @@ ANCHOR = 3  # 3..5 where the rock was when its time at rest began
 REFERENCE = 6  # 6..8 sum of its contact impulses when it came to rest [N s]
 BOOK_WIDTH = 9
 
+# In CHANGED_STEPS: the rock has just come to rest, its reference is not set yet.
+NEW = -1.0
+
 
 @kernel
 def is_sensed(x: float, y: float, z: float, radius: float, sensors: Array) -> bool:
@@ -93,7 +96,6 @@ def rest(
     positions: Array,
     velocities: Array,
     radius: Array,
-    sums: Array,
     sensors: Array,
     time_step: float,
     displacement: float,
@@ -106,7 +108,7 @@ def rest(
     """Let awake rocks come to rest, and take those that left the site out.
 
     Args:
-        book, positions, radius, sums, sensors: as for `wake`.
+        book, positions, radius, sensors: as for `wake`.
         velocities: (n, 6) changed: zero for rocks that come to rest.
         time_step: [s].
         displacement, time, speed: see `RestConfig`.
@@ -114,7 +116,7 @@ def rest(
         may_rest: False: only lost rocks are looked for.
 
     Returns:
-        number of rocks that came to rest, number lost.
+        number of rocks that came to rest (their reference is left to `set_references`), number lost.
     """
     n_rested, n_lost = 0, 0
     for i in range(len(book)):
@@ -148,10 +150,18 @@ def rest(
             and not is_sensed(positions[i, 0], positions[i, 1], positions[i, 2], radius[i], sensors)
         ):
             book[i, STATUS] = RESTING
-            book[i, CHANGED_STEPS] = 0.0
-            for d in range(3):
-                book[i, REFERENCE + d] = sums[i, d]
+            book[i, CHANGED_STEPS] = NEW
             for d in range(6):
                 velocities[i, d] = 0.0
             n_rested += 1
     return n_rested, n_lost
+
+
+@kernel
+def set_references(book: Array, sums: Array) -> None:
+    """Keep the sum of the contact impulses (n, 3) of the rocks that have just come to rest."""
+    for i in range(len(book)):
+        if book[i, CHANGED_STEPS] == NEW:
+            book[i, CHANGED_STEPS] = 0.0
+            for d in range(3):
+                book[i, REFERENCE + d] = sums[i, d]

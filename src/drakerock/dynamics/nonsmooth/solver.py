@@ -583,6 +583,7 @@ def solve_resting(
     n_rows: int,
     body_a: Array,
     body_b: Array,
+    awake: Array,
     bodies: Array,
     n_rocks: int,
     machine: MachineArrays,
@@ -600,20 +601,24 @@ def solve_resting(
     Args:
         rows, n_rows, body_a, body_b: prepared contact rows with the warm start's impulses; the machine's are the
             last. Impulses are set.
+        awake: (m,) rocks that can move.
         bodies, machine, velocity: with gravity and free velocities, without the warm start; changed.
         n_rocks: see `prepare_rows`.
         iterations: number of sweeps.
         packed, index, bodies_32: (rows, PACKED_WIDTH) and (n_rocks + 1, BODY_WIDTH) float32, (rows, 3) int32
-            scratch.
+            scratch; `bodies_32` has to be zero and is left so.
 
     Returns:
         the residual: the last sweep's change of the normal impulses over their sum.
     """
-    free = bodies.copy()
+    free = np.empty((len(awake), 6))
+    for s in range(len(awake)):
+        for d in range(6):
+            free[s, d] = bodies[awake[s], d]
     apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity)
-    for i in range(n_rocks + 1):
+    for s in range(len(awake)):
         for d in range(INVERSE_INERTIA + 6):
-            bodies_32[i, d] = bodies[i, d]
+            bodies_32[awake[s], d] = bodies[awake[s], d]
     n_free = _find_machine_rows(n_rows, body_b, n_rocks)
     forwards = np.arange(n_free, n_rows)
     backwards = forwards[::-1].copy()
@@ -638,7 +643,11 @@ def solve_resting(
     for k in range(n_free):
         for d in range(3):
             rows[index[k, 2], IMPULSE + d] = packed[k, IMPULSE + d]
-    bodies[:] = free
+    for s in range(len(awake)):
+        for d in range(6):
+            bodies[awake[s], d] = free[s, d]
+        # What is not awake stays zero: at rest, and immovable.
+        bodies_32[awake[s]] = 0.0
     apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, np.zeros(len(velocity)))
     total = 0.0
     for k in range(n_rows):

@@ -128,11 +128,16 @@ def test_contact_memory_is_found_again():
     sums = np.zeros((1, 3))
     contacts.sum_impulses(arrays.memory, arrays.n_memory, 1, sums)
     np.testing.assert_allclose(sums[0], [0, 0, engine.mass[0] * 9.81 * 0.01], rtol=1e-4, atol=1e-6)
-    table = np.zeros(64, np.int64)
-    contacts.index_memory(arrays.memory, arrays.n_memory, table)
+    table = np.zeros(128, np.int64)
+    status = np.zeros(1, np.int64)
+    assert contacts.index_memory(arrays.memory, arrays.n_memory, 1, status, table) == 64
+    table = table[:64]
     key = int(arrays.memory[0, contacts.MEMORY_KEY])
     assert contacts.find_in_memory(key, arrays.memory, table) == 0
     assert contacts.find_in_memory(key + 1, arrays.memory, table) == -1
+    # pairs without an awake rock are not searched
+    contacts.index_memory(arrays.memory, arrays.n_memory, 1, status + 1, table)
+    assert contacts.find_in_memory(key, arrays.memory, table) == -1
 
 
 def settle(n=25, seed=0):

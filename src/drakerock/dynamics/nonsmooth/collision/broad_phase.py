@@ -288,7 +288,7 @@ def calc_piece_boxes(
                 rotations[i, d, e] = X_WBs[b, d, e]
         r = get_rotation(rotations, i)
         for corner in range(shapes.vertex_start[shape[i]], shapes.vertex_start[shape[i] + 1]):
-            x, y, z = get_corner(shapes, corner, 1.0, r)
+            x, y, z = get_corner(shapes.vertices, corner, 1.0, r)
             vx = V_WBs[b, 3] + V_WBs[b, 1] * z - V_WBs[b, 2] * y
             vy = V_WBs[b, 4] + V_WBs[b, 2] * x - V_WBs[b, 0] * z
             vz = V_WBs[b, 5] + V_WBs[b, 0] * y - V_WBs[b, 1] * x

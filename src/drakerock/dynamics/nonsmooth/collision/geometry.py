@@ -76,11 +76,11 @@ def calc_support_distance(
 
 
 @kernel
-def get_corner(shapes: ConvexShapes, corner: int, scale: float, r: Rotation) -> Vector:
+def get_corner(vertices: Array, corner: int, scale: float, r: Rotation) -> Vector:
     """Return a corner of a core in W's axes, from the frame's origin."""
     return rotate(
         r,
-        scale * shapes.vertices[corner, 0],
-        scale * shapes.vertices[corner, 1],
-        scale * shapes.vertices[corner, 2],
+        scale * vertices[corner, 0],
+        scale * vertices[corner, 1],
+        scale * vertices[corner, 2],
     )

@@ -164,8 +164,8 @@ def calc_core_distance(
         corner_a, _ = find_support(vertices, first_a, last_a, lx, ly, lz)
         lx, ly, lz = rotate_back(r_b, -vx, -vy, -vz)
         corner_b, _ = find_support(vertices, first_b, last_b, lx, ly, lz)
-        ax, ay, az = get_corner(shapes, corner_a, scale_a, r_a)
-        bx, by, bz = get_corner(shapes, corner_b, scale_b, r_b)
+        ax, ay, az = get_corner(vertices, corner_a, scale_a, r_a)
+        bx, by, bz = get_corner(vertices, corner_b, scale_b, r_b)
         wx, wy, wz = px + bx - ax, py + by - ay, pz + bz - az
         bound = vx * wx + vy * wy + vz * wz
         if bound > 0.0 and bound * bound > max_distance * max_distance * (vx * vx + vy * vy + vz * vz):

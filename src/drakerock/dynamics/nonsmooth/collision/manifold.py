@@ -162,12 +162,12 @@ def make_manifold(
     first, last = shapes.face_vertex_start[incident], shapes.face_vertex_start[incident + 1]
     n_outline = last - first
     for k in range(n_outline):
-        x, y, z = get_corner(shapes, shapes.face_vertices[first + k], inc_scale, inc_r)
+        x, y, z = get_corner(shapes.vertices, shapes.face_vertices[first + k], inc_scale, inc_r)
         outline[k, 0], outline[k, 1], outline[k, 2] = x + ix, y + iy, z + iz
     first, last = shapes.face_vertex_start[reference], shapes.face_vertex_start[reference + 1]
-    ax, ay, az = get_corner(shapes, shapes.face_vertices[last - 1], ref_scale, ref_r)
+    ax, ay, az = get_corner(shapes.vertices, shapes.face_vertices[last - 1], ref_scale, ref_r)
     for k in range(first, last):
-        bx, by, bz = get_corner(shapes, shapes.face_vertices[k], ref_scale, ref_r)
+        bx, by, bz = get_corner(shapes.vertices, shapes.face_vertices[k], ref_scale, ref_r)
         ex, ey, ez = bx - ax, by - ay, bz - az
         n_outline = _clip(
             outline, n_outline, clipped, ax + rx, ay + ry, az + rz,

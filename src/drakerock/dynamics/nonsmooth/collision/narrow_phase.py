@@ -76,7 +76,7 @@ def _find_plane_points(
         along = lx * shapes.vertices[k, 0] + ly * shapes.vertices[k, 1] + lz * shapes.vertices[k, 2]
         gap = height + scale * along
         if gap < max_gap and n_candidates < len(candidates):
-            cx, cy, cz = get_corner(shapes, k, scale, r)
+            cx, cy, cz = get_corner(shapes.vertices, k, scale, r)
             shift = rounding + 0.5 * gap
             candidates[n_candidates, 0] = cx - shift * plane[0]
             candidates[n_candidates, 1] = cy - shift * plane[1]
@@ -115,7 +115,7 @@ def _add_fast_points(
     rounding = scale * shapes.rounding[shape]
     n_candidates = 0
     for k in range(shapes.vertex_start[shape], shapes.vertex_start[shape + 1]):
-        cx, cy, cz = get_corner(shapes, k, scale, r)
+        cx, cy, cz = get_corner(shapes.vertices, k, scale, r)
         gap = offset - rounding - (nx * cx + ny * cy + nz * cz)
         if gap < max_gap and n_candidates < len(candidates):
             shift = rounding + 0.5 * gap

@@ -82,7 +82,7 @@ def calc_core_penetration(
             if separation > best:
                 best = separation
                 nx, ny, nz = sign * wx, sign * wy, sign * wz
-                cx, cy, cz = get_corner(shapes, deepest, other_scale, other_r)
+                cx, cy, cz = get_corner(shapes.vertices, deepest, other_scale, other_r)
                 if side == 0:
                     # B's deepest corner, taken back onto A's face
                     cx, cy, cz = (
@@ -91,8 +91,8 @@ def calc_core_penetration(
                         cz + pz - separation * wz,
                     )
     for edge_a in range(shapes.edge_start[shape_a], shapes.edge_start[shape_a + 1]):
-        a0x, a0y, a0z = get_corner(shapes, shapes.edge_vertices[edge_a, 0], scale_a, r_a)
-        a1x, a1y, a1z = get_corner(shapes, shapes.edge_vertices[edge_a, 1], scale_a, r_a)
+        a0x, a0y, a0z = get_corner(shapes.vertices, shapes.edge_vertices[edge_a, 0], scale_a, r_a)
+        a1x, a1y, a1z = get_corner(shapes.vertices, shapes.edge_vertices[edge_a, 1], scale_a, r_a)
         ux, uy, uz = a1x - a0x, a1y - a0y, a1z - a0z
         face = shapes.edge_faces[edge_a, 0]
         m0x, m0y, m0z = rotate(
@@ -103,8 +103,8 @@ def calc_core_penetration(
             r_a, shapes.face_normals[face, 0], shapes.face_normals[face, 1], shapes.face_normals[face, 2]
         )
         for edge_b in range(shapes.edge_start[shape_b], shapes.edge_start[shape_b + 1]):
-            b0x, b0y, b0z = get_corner(shapes, shapes.edge_vertices[edge_b, 0], scale_b, r_b)
-            b1x, b1y, b1z = get_corner(shapes, shapes.edge_vertices[edge_b, 1], scale_b, r_b)
+            b0x, b0y, b0z = get_corner(shapes.vertices, shapes.edge_vertices[edge_b, 0], scale_b, r_b)
+            b1x, b1y, b1z = get_corner(shapes.vertices, shapes.edge_vertices[edge_b, 1], scale_b, r_b)
             vx, vy, vz = b1x - b0x, b1y - b0y, b1z - b0z
             face = shapes.edge_faces[edge_b, 0]
             # B's normals enter negated: the Gauss map of -B.
@@ -171,5 +171,5 @@ def calc_core_penetration(
             )
             best = separation
             nx, ny, nz = hx, hy, hz
-            cx, cy, cz = get_corner(shapes, corner, scale_a, r_a)
+            cx, cy, cz = get_corner(shapes.vertices, corner, scale_a, r_a)
     return best, nx, ny, nz, cx, cy, cz
