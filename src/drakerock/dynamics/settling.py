@@ -183,6 +183,9 @@ def drop_rocks(
             progress("dropping rocks", 0.8 * len(pile) / total)
         placed, waiting = place_rocks(waiting, pile, shapes, low, high, rng)
         if len(placed) == 0:
+            # A large rock over a high pile has little room: it is looked for longer before giving up.
+            placed, waiting = place_rocks(waiting, pile, shapes, low, high, rng, tries=4000)
+        if len(placed) == 0:
             raise InputError(
                 f"pile.rocks: only {len(pile)} of {total} rocks fit below pile.emission_height = "
                 f"{recipe.pile.emission_height:g} m; raise it, widen the site, or ask for fewer rocks"
