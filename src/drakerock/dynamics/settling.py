@@ -230,7 +230,8 @@ def refill(
     turns = (
         Rotation.random(len(waiting), rng=rng).as_quat(scalar_first=True) if len(waiting) else waiting.q_WRs
     )
-    waiting = replace(waiting, q_WRs=turns, V_WRs=np.zeros((len(waiting), 6)))
+    # Without the contacts they had: a rock that was at rest would hang in the air.
+    waiting = replace(waiting, q_WRs=turns, V_WRs=np.zeros((len(waiting), 6)), contacts=None)
     return drop_rocks(waiting, pile.select(~removed), shapes, recipe, rng)
 
 

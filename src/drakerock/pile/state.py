@@ -36,7 +36,8 @@ class ContactMemory:
     def select(self, rocks: NDArray[np.int64], n: int) -> ContactMemory:
         """Return the contacts among the chosen rocks (indices into n rocks), renumbered.
 
-        Pairs whose rocks change order are left out, since points belong to the first rock's frame.
+        Pairs whose rocks change order are left out, since points belong to the first rock's frame. A rock that
+        loses a contact so no longer rests: what held it may be gone.
         """
         number = np.full(n, -1, np.int64)
         number[rocks] = np.arange(len(rocks))
@@ -44,11 +45,14 @@ class ContactMemory:
         new_first = number[first]
         new_second = np.where(second < 0, second, number[np.maximum(second, 0)])
         kept = (new_first >= 0) & ((second < 0) | (new_second > new_first))
+        resting = self.resting.copy()
+        resting[first[~kept]] = False
+        resting[second[~kept & (second >= 0)]] = False
         return ContactMemory(
             np.column_stack([new_first, new_second])[kept],
             self.points[kept],
             self.impulses[kept],
-            self.resting[rocks],
+            resting[rocks],
         )
 
     def join(self, other: ContactMemory) -> ContactMemory:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drakerock.errors import InputError
-from drakerock.pile.state import PileState, load_pile, save_pile
+from drakerock.pile.state import ContactMemory, PileState, load_pile, save_pile
 
 
 def test_round_trip_is_exact(heap, tmp_path):
@@ -65,3 +65,14 @@ def test_select_and_join_are_inverse(heap):
     order = np.argsort(np.concatenate([np.flatnonzero(mask), np.flatnonzero(~mask)]))
     assert np.array_equal(joined.p_WRs[order], heap.p_WRs)
     assert isinstance(joined, PileState)
+
+
+def test_a_rock_that_loses_a_contact_no_longer_rests(heap):
+    contacts = ContactMemory(
+        np.array([[0, 1], [1, 2], [3, -1]]), np.zeros((3, 3)), np.ones((3, 3)), np.ones(len(heap), bool)
+    )
+    pile = replace(heap, contacts=contacts)
+    kept = np.arange(len(heap)) != 1
+    rest = pile.select(kept).contacts
+    assert np.array_equal(rest.pairs, [[2, -1]])  # rock 3 on the site, renumbered
+    assert list(np.flatnonzero(~rest.resting)) == [0, 1]  # rocks 0 and 2 leant on rock 1
