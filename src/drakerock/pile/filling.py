@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from drakerock.pile.config import PileConfig, SiteConfig
 from drakerock.pile.state import PileState
 
 Array = NDArray[np.float64]
-ArraysT = TypeVar("ArraysT")
 
 # The void is full when this many layers in a row found no room.
 FULL_AFTER = 8
@@ -23,7 +22,7 @@ START_SPEED = 3.0
 PLACING_TRIES = 12
 
 
-class RockStepper(Protocol[ArraysT]):
+class RockStepper[ArraysT](Protocol):
     """What filling needs of a rock engine; `ArraysT` is the engine's state, opaque here.
 
     The engine's own attributes: `time_step` [s], and `radius`, (n,) bounding radii about the rocks' centres
@@ -53,7 +52,7 @@ class RockStepper(Protocol[ArraysT]):
         ...
 
 
-def fill(
+def fill[ArraysT](
     engine: RockStepper[ArraysT],
     pile: PileState,
     waiting: NDArray[np.int64],

@@ -391,6 +391,9 @@ class NonsmoothEngine:
         Raises:
             SimulationFailure: the result is not finite, also when solved again more carefully.
         """
+        for name in ("positions", "quaternions", "velocities"):
+            if not np.isfinite(getattr(arrays, name)).all():
+                raise SimulationFailure(f"rocks: {name} that are not finite")
         iterations = self.config.iterations
         new, report = self._try_step(arrays, machine, iterations, warm=True)
         if new is not None and report is not None and report.residual <= self.config.max_residual:
