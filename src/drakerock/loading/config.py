@@ -58,6 +58,7 @@ class ControlConfig(Config):
         float, Field(gt=0, le=1, description="lowest speed before a waypoint, share of its segment's maximum")
     ] = 0.1
     timeout: Annotated[float, Field(gt=0, description="allowed beyond a segment's planned time [s]")] = 5.0
+    approach_time: Annotated[float, Field(gt=0, description="allowed from the start to s0 [s]")] = 20.0
 
 
 class PerformanceConfig(Config):
@@ -67,8 +68,14 @@ class PerformanceConfig(Config):
     t_char: Annotated[float, Field(gt=0, description="characteristic time of the damage integral [s]")] = 12.0
     settle_time: Annotated[
         float, Field(ge=0, le=60, description="at most this long after s4 for the rocks to rest [s]")
-    ] = 4.0
-    rest_speed: Annotated[float, Field(gt=0, description="rocks slower than this rest [m/s]")] = 0.1
+    ] = 6.0
+    rest_speed: Annotated[
+        float, Field(gt=0, description="rocks rest when all are slower than this, on average ... [m/s]")
+    ] = 0.05
+    rest_window: Annotated[float, Field(gt=0, le=10, description="... over this time [s]")] = 0.5
+    weighing_delay: Annotated[
+        float, Field(ge=0, le=10, description="after s4, until the braked machine's weight is read [s]")
+    ] = 0.5
     stall_speed: Annotated[
         float, Field(gt=0, description="stall: slower than this while told to drive on [m/s]")
     ] = 0.05

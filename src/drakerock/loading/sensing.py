@@ -20,8 +20,9 @@ Array = NDArray[np.float64]
 
 def make_grid(site: SiteConfig, cell: float, length: float) -> tuple[Array, Array]:
     """Return the cell centres (x, y) that cover the last `length` of the drift before the brow."""
-    nx = max(1, int(np.ceil(length / cell)))
-    ny = max(1, int(np.floor(site.drift_width / cell)))
+    # A hair's room, so that a width of a whole number of cells is not one short by rounding.
+    nx = max(1, int(np.ceil(length / cell - 1e-9)))
+    ny = max(1, int(np.floor(site.drift_width / cell + 1e-9)))
     x = -cell * (np.arange(nx, dtype=np.float64)[::-1] + 0.5)
     y = cell * (np.arange(ny, dtype=np.float64) - 0.5 * (ny - 1))
     return x, y

@@ -1,11 +1,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial import ConvexHull
 
 from drakerock.loading.config import SensingConfig
-from drakerock.loading.sensing import PileSensor, calc_height_field
+from drakerock.loading.sensing import PileSensor, calc_height_field, make_grid
 from drakerock.pile.config import SiteConfig
 from drakerock.pile.state import make_empty_pile
 
@@ -35,6 +36,15 @@ def test_height_field_is_the_rocks_upper_surface(heap, shapes):
         for j in range(0, len(field.y), 2):
             expected = find_height_by_half_spaces(heap, shapes, field.x[i], field.y[j])
             assert abs(field.h[i, j] - expected) < 2e-4
+
+
+@pytest.mark.parametrize("cells", range(5, 40))
+def test_width_of_whole_cells_is_covered_by_them(cells):
+    x, y = make_grid(SiteConfig(drift_width=cells * 0.26), 0.26, 26.0)
+    assert len(y) == cells
+    assert len(x) == 100
+    assert x[-1] == pytest.approx(-0.13)
+    assert y.sum() == pytest.approx(0.0, abs=1e-12)
 
 
 def test_no_rocks_no_height(shapes):
