@@ -151,8 +151,9 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
         scenario.recording.motion_threshold,
     )  # fmt: skip
     plant_context = station.plant.GetMyMutableContextFromRoot(root)
-    _place(station, root, x_tip=-0.5 * scenario.site.drift_length, y=0.0)
-    # Sensing and planning need the rocks only; they tell where the machine starts.
+    # Sensing and planning come first: they tell where the machine starts. Only a scanner's view depends on where
+    # it stands meanwhile.
+    _place(station, root, x_tip=-scenario.loading.sensing.scanner.distance, y=0.0)
     station.diagram.ExecuteInitializationEvents(root)
     field: HeightField = station.diagram.GetOutputPort("height_field").Eval(root)
     plan: DigPlan | NoPlan = station.diagram.GetOutputPort("plan").Eval(root)

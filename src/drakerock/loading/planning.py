@@ -401,7 +401,7 @@ def _assemble(
 
 
 class DigPlanner(LeafSystem):
-    """Plans once, when the Diagram is initialised, from what the sensor sees then.
+    """Plans once, when the Diagram is initialised, from what the sensor sees then, or takes a stored plan.
 
     Input port:
         ``height_field``: abstract, a `HeightField` in W.
@@ -418,11 +418,13 @@ class DigPlanner(LeafSystem):
         sensing: SensingConfig,
         drift_width: float,
         speed_floor: float,
+        stored: DigPlan | NoPlan | None = None,
     ) -> None:
-        """Make the planner of one strategy."""
+        """Make the planner of one strategy; arguments as of `make_dig_plan`, or a `stored` plan to give out."""
         super().__init__()
         self.set_name("dig_planner")
         self._arguments = (strategy, machine, config, sensing, drift_width, speed_floor)
+        self._stored = stored
         empty = HeightField(np.zeros(0), np.zeros(0), np.zeros((0, 0)), sensing.cell)
         self._field = self.DeclareAbstractInputPort("height_field", AbstractValue.Make(empty))
         self._plan = self.DeclareAbstractState(AbstractValue.Make(NoPlan("not initialised")))
@@ -430,5 +432,7 @@ class DigPlanner(LeafSystem):
         self.DeclareStateOutputPort("plan", self._plan)
 
     def _initialize(self, context: Context, state: State) -> None:
-        field = self._field.Eval(context)
-        state.get_mutable_abstract_state(int(self._plan)).set_value(make_dig_plan(field, *self._arguments))
+        plan = self._stored
+        if plan is None:
+            plan = make_dig_plan(self._field.Eval(context), *self._arguments)
+        state.get_mutable_abstract_state(int(self._plan)).set_value(plan)
