@@ -1,6 +1,6 @@
 """The nonsmooth engine against the plant engine: the same machine digs the same small piles.
 
-    python benchmarks/compare_engines.py --rocks 120 --seeds 4 --out build/engines.jsonl
+    python benchmarks/compare_engines.py --rocks 300 --seeds 4 --out build/engines.jsonl
 
 Each seed is one pile, filled and at rest in the nonsmooth engine, relaxed for a second in each engine with the
 machine standing, then dug with the same motor targets. Finished runs are skipped.
@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from faithfulness import make_small_pile
+from faithfulness import SIZES, make_small_pile
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from rocks import ROCKS, SHAPES, TIME_STEP, Motors, clear_way, make_dig
@@ -101,7 +101,7 @@ def run(pile: PileState, engine: str, site: SiteConfig, depth: float, duration: 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rocks", type=int, default=120)
+    parser.add_argument("--rocks", type=int, default=300)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--duration", type=float, default=10.0)
     parser.add_argument("--out", type=Path, default=Path("build/engines.jsonl"))
@@ -109,13 +109,13 @@ def main() -> None:
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
     results = {(r["seed"], r["engine"]): r for r in map(json.loads, lines)}
-    site = SiteConfig(drift_width=4.4, void_depth=0.8)
+    site = SIZES["300"][1]
     for seed in range(arguments.seeds):
         if all((seed, engine) in results for engine in ("plant", "nonsmooth")):
             continue
-        pile = clear_way(make_small_pile(arguments.rocks, site, 5.0, seed))
+        pile = clear_way(make_small_pile(arguments.rocks, site, 6.0, seed))
         pile = replace(pile, V_WRs=np.zeros((len(pile), 6)))
-        depth = np.random.default_rng(seed).uniform(0.8, 2.0)
+        depth = np.random.default_rng(seed).uniform(0.6, 1.4)
         for engine in ("nonsmooth", "plant"):
             result = run(pile, engine, site, depth, arguments.duration)
             results[seed, engine] = result

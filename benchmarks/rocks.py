@@ -21,6 +21,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
 from drakerock.dynamics.assembly import add_plant, add_site
 from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
+from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.nonsmooth.engine import NonsmoothEngine
 from drakerock.dynamics.nonsmooth.system import NonsmoothRocks, add_nonsmooth_rocks
 from drakerock.machine.config import MachineConfig
@@ -247,7 +248,11 @@ def run_dig(
     n_steps = round(duration / time_step)
     tip = plant.GetFrameByName("tip")
     start = tip.CalcPoseInWorld(plant_context).translation()[0]
-    forces, summaries, reach = np.zeros((n_steps, 6)), np.zeros((n_steps, 6)), np.zeros(n_steps)
+    forces, summaries, reach = (
+        np.zeros((n_steps, 6)),
+        np.zeros((n_steps, len(ROCK_SUMMARY))),
+        np.zeros(n_steps),
+    )
     fastest = 0.0
     cpu = time.process_time()
     for k in range(n_steps):
@@ -286,6 +291,7 @@ def run_dig(
         "residual_max": float(summaries[:, 4].max()),
         "fastest_m_s": fastest,
         "lost": float(summaries[-1, 5]),
+        "flagged": float(summaries[-1, 6]),
     }
 
 
@@ -296,19 +302,24 @@ def bench_dig(pile: PileState, depth: float, reduction: str) -> None:
 
 
 def bench_scaling(pile: PileState) -> None:
-    """The same shallow dig with the pile's void four times as full of rocks behind it."""
-    site = SiteConfig(drift_width=6.5, void_depth=7.2 + 3 * 9.0)
-    copies = [pile]
-    deep = pile.p_WRs[:, 0] > 0.6
-    block = pile.select(deep)
-    for k in range(1, 6):
-        copies.append(replace(block, p_WRs=block.p_WRs + [5.0 * k + 2.0 * (k > 0), 0, 0]))
-    total = copies[0]
-    for item in copies[1:]:
-        total = total.join(item)
-    for name, rocks, where in (("one", pile, SITE), ("many", total, site)):
+    """The same shallow dig with four more blocks of the same pile behind it, about 22 000 rocks."""
+    block = pile.select(pile.p_WRs[:, 0] > 0.6)
+    width = SITE.void_depth - 0.5
+    n_blocks = 4
+    total = pile
+    for k in range(1, n_blocks + 1):
+        total = total.join(replace(block, p_WRs=block.p_WRs + [k * width, 0.0, 0.0]))
+    site = SITE.model_copy(update={"void_depth": SITE.void_depth + n_blocks * width})
+    # They lean on each other now instead of on a wall.
+    engine = make_engine(total, site)
+    arrays = engine.make_arrays(total)
+    for _ in range(300):
+        arrays, report = engine.advance(arrays)
+    print(f"scaling: {len(total)} rocks, {report.n_awake} awake after 3 s without a machine")
+    total = engine.make_pile(arrays)
+    for rocks, where in ((pile, SITE), (total, site)):
         result = run_dig(rocks, make_dig(1.0), NonsmoothConfig(), site=where)
-        print(f"scaling: {name}, {len(rocks)} rocks: " + ", ".join(f"{k} {v:.4g}" for k, v in result.items()))
+        print(f"scaling: {len(rocks)} rocks: " + ", ".join(f"{k} {v:.4g}" for k, v in result.items()))
 
 
 CASES: dict[str, Callable[[PileState], None]] = {

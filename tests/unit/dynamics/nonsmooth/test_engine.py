@@ -9,11 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
+from pydrake.systems.analysis import Simulator
 from scipy.spatial.transform import Rotation
 
 from drakerock.dynamics.config import NonsmoothConfig, RestConfig
+from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.nonsmooth import contacts, motion, reduction
 from drakerock.dynamics.nonsmooth.engine import make_machineless_step
+from drakerock.dynamics.nonsmooth.system import NonsmoothRocks
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.pile.config import PileConfig, RocksConfig, SiteConfig
 from drakerock.pile.filling import fill
@@ -251,6 +254,7 @@ def test_a_step_that_does_not_converge_is_redone():
     engine = make_engine(pile, [make_box(0.8, 0.8, 0.5)], config=config)
     _, report = engine.advance(engine.make_arrays(pile))
     assert report.redone
+    assert report.flagged
 
 
 def test_deep_overlap_recovers_slowly():
@@ -258,11 +262,14 @@ def test_deep_overlap_recovers_slowly():
     engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)], gravity=0.0)
     arrays = engine.make_arrays(pile)
     fastest = 0.0
+    arrays, report = engine.advance(arrays)
+    assert report.flagged
     for _ in range(200):
         arrays, report = engine.advance(arrays)
         fastest = max(fastest, np.abs(arrays.velocities[:, 3:]).max())
     assert fastest <= engine.config.max_recovery_speed
     assert report.max_penetration < 1e-3
+    assert not report.flagged
 
 
 @settings(max_examples=50, deadline=None)
@@ -317,3 +324,29 @@ def test_a_damaged_pile_file_is_refused(tmp_path):
     path.write_bytes(bytes(data))
     with pytest.raises(InputError):
         load_pile(path)
+
+
+def test_a_site_without_rocks_steps():
+    pile = make_pile(np.zeros((0, 3)), quaternions=np.zeros((0, 4)), velocities=np.zeros((0, 6)))
+    engine = make_engine(pile, SHAPES)
+    _, report = engine.advance(engine.make_arrays(pile))
+    assert report.n_awake == report.n_contacts == 0
+
+
+def test_the_system_runs_without_a_machine_and_steps_as_the_engine_does():
+    pile = draw_pile(0, 20)
+    engine = make_engine(pile, SHAPES, make_plane_site(planes=5))
+    system = NonsmoothRocks(engine, pile)
+    simulator = Simulator(system)
+    simulator.AdvanceTo(0.5)
+    expected, _ = run(engine, engine.make_arrays(pile), 0.5)
+    actual = system.get_pile(simulator.get_context())
+    assert np.array_equal(actual.p_WRs, expected.positions)
+    poses = system.GetOutputPort("rock_poses").Eval(simulator.get_context()).reshape(-1, 7)
+    assert np.array_equal(poses, np.hstack([expected.quaternions, expected.positions]))
+    velocities = system.GetOutputPort("rock_velocities").Eval(simulator.get_context())
+    assert np.array_equal(velocities.reshape(-1, 6), expected.velocities)
+    summary = system.GetOutputPort("rock_summary").Eval(simulator.get_context())
+    assert summary[list(ROCK_SUMMARY).index("n_awake")] == len(pile)
+    assert not system.GetOutputPort("F_B_W").Eval(simulator.get_context()).any()
+    assert not system.GetOutputPort("rock_status").Eval(simulator.get_context()).any()
