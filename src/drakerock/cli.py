@@ -76,7 +76,16 @@ def pile(
     if json_:
         print(json.dumps(summary))
         return
+    gradation = Table(title="Gradation", title_justify="left")
+    for name in ("sieve width", "rocks", "mass", "share", "wanted"):
+        gradation.add_column(name, justify="right")
+    for item in summary.pop("gradation"):
+        gradation.add_row(
+            f"{item['size_m']:g} m", f"{item['rocks']}", f"{item['mass_kg'] / 1e3:.1f} t",
+            f"{100 * item['share']:.1f} +- {100 * item['standard_error']:.1f} %", f"{100 * item['wanted']:.0f} %",
+        )  # fmt: skip
     _print_table("Pile", summary)
+    output.print(gradation)
     _print_paths(paths)
 
 

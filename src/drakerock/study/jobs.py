@@ -9,16 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from drakerock.dynamics.settling import fetch_pile
+from drakerock.dynamics.settling import calc_creep, fetch_pile
 from drakerock.exploration.noise import calc_standard_error
 from drakerock.loading.cycle import CycleOutcome, make_folder, run_cycle, save_cycle, write_text
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.loading.sequence import run_sequence
 from drakerock.pile.shapes import load_rock_shapes
+from drakerock.pile.site import make_site
 from drakerock.pile.state import PileState, save_pile
 from drakerock.pile.summary import calc_summary
 from drakerock.viewing.cycle_figures import write_cycle_figures
 from drakerock.viewing.pile_figures import write_pile_picture
+from drakerock.viewing.pile_page import write_pile_page
 from drakerock.viewing.replay import write_replay
 
 
@@ -138,21 +140,32 @@ def _summarise(values: list[float | None]) -> dict[str, Any]:
 def make_pile_files(
     scenario: Scenario, folder: Path, progress: Callable[..., None]
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Make or fetch the scenario's pile and write pile.npz, pile.json and pile.png.
+    """Make or fetch the scenario's pile and write pile.npz, pile.json, pile.png and pile.html.
 
     Returns:
-        The summary, and the paths written.
+        The summary, and the paths written. ``at_rest`` is measured: all rocks are woken for half a second.
 
     Raises:
         InputError: bad configuration, or the folder cannot be written.
         SimulationFailure: the pile could not be made.
     """
     make_folder(folder)
-    pile, source = fetch_pile(make_recipe(scenario), progress)
+    recipe = make_recipe(scenario)
+    pile, source = fetch_pile(recipe, progress)
     shapes = load_rock_shapes(scenario.rocks.shapes)
-    summary = calc_summary(pile, shapes, scenario.rocks) | {"taken_from": str(source)}
-    paths = [folder / "pile.npz", folder / "pile.json", folder / "pile.png"]
+    progress("measuring", None)
+    site = make_site(scenario.site)
+    moved = calc_creep(pile, shapes, recipe, scenario.pile.settle_window)
+    p99 = float(np.percentile(moved, 99)) if len(moved) else 0.0
+    summary = calc_summary(pile, shapes, scenario.rocks, site, scenario.dynamics.time_step) | {
+        "at_rest": p99 < scenario.pile.settle_speed * scenario.pile.settle_window,
+        "creep_mm_p99": round(1e3 * p99, 3),
+        "taken_from": str(source),
+    }
+    progress("writing", None)
+    paths = [folder / name for name in ("pile.npz", "pile.json", "pile.png", "pile.html")]
     save_pile(pile, paths[0])
     write_text(paths[1], json.dumps(summary | {"provenance": pile.provenance}, indent=2) + "\n")
     write_pile_picture(pile, shapes, scenario.site, paths[2])
+    write_pile_page(pile, shapes, scenario.site, paths[3])
     return summary, paths
