@@ -3,7 +3,7 @@
     OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python benchmarks/rocks.py all
     ... benchmarks/rocks.py awake resting quality woken shallow deep shallow-none deep-none scaling
 
-The pile (about 5 500 moving rocks in a drift of 6.5 m) is filled on first use, kept in the user's cache folder.
+The pile is the default scenario's, about 5 500 moving rocks in a drift of 6.5 m.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import platformdirs
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
@@ -24,22 +23,19 @@ from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
 from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.nonsmooth.engine import NonsmoothEngine
 from drakerock.dynamics.nonsmooth.system import NonsmoothRocks, add_nonsmooth_rocks
+from drakerock.dynamics.settling import fetch_pile
+from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.machine.config import MachineConfig
 from drakerock.machine.model import Machine, add_machine, calc_motor_targets
 from drakerock.machine.placement import set_machine_pose
-from drakerock.pile.config import PileConfig, RocksConfig, SiteConfig
-from drakerock.pile.emission import sample_rocks
-from drakerock.pile.filling import fill
+from drakerock.pile.config import RocksConfig, SiteConfig
 from drakerock.pile.shapes import load_rock_shapes
 from drakerock.pile.site import make_site
-from drakerock.pile.state import PileState, load_pile, save_pile
+from drakerock.pile.state import PileState, load_pile
 
 ROCKS = RocksConfig()
 SHAPES = load_rock_shapes(ROCKS.shapes)
-SITE = SiteConfig(drift_width=6.5, void_depth=7.2)
-FILLING = PileConfig(
-    emission_height=8.0, batch_time=0.25, settle_speed=0.01, settle_window=0.5, max_time=150.0
-)
+SITE = SiteConfig()
 TIME_STEP = 0.01
 
 
@@ -56,30 +52,9 @@ def make_engine(pile: PileState, site: SiteConfig = SITE, **settings: object) ->
     )
 
 
-def get_pile(seed: int = 0, n: int = 7500, site: SiteConfig = SITE) -> PileState:
-    """Return the benchmark's pile, filled and settled on first use (minutes)."""
-    folder = Path(platformdirs.user_cache_dir("drakerock")) / "benchmarks"
-    path = folder / f"pile-{site.drift_width:g}-{site.void_depth:g}-{n}-{seed}.npz"
-    if path.exists():
-        return load_pile(path)
-    rng = np.random.default_rng(seed)
-    pile = sample_rocks(n, ROCKS, SHAPES, rng)
-    pile = replace(pile, p_WRs=np.tile([0.0, 0.0, -50.0], (n, 1)))
-    engine = make_engine(pile, site)
-    start = time.perf_counter()
-
-    def report(t: float, waiting: int, step: object) -> None:
-        if round(t / TIME_STEP) % 500 == 0:
-            print(
-                f"  filling: {t:.0f} s, {waiting} waiting, {time.perf_counter() - start:.0f} s wall",
-                flush=True,
-            )
-
-    pile, waiting = fill(engine, pile, np.arange(n), site, FILLING, rng, report)
-    pile = pile.select(np.setdiff1d(np.flatnonzero(pile.p_WRs[:, 2] > -1.0), waiting))
-    folder.mkdir(parents=True, exist_ok=True)
-    save_pile(pile, path)
-    return pile
+def get_pile() -> PileState:
+    """Return the default scenario's pile; made on first use (a minute) if it is not the shipped one."""
+    return fetch_pile(make_recipe(Scenario()))[0]
 
 
 def time_steps(engine: NonsmoothEngine, pile: PileState, n: int) -> tuple[PileState, float, list[object]]:

@@ -18,10 +18,8 @@ from drakerock.dynamics.nonsmooth import contacts, motion, reduction
 from drakerock.dynamics.nonsmooth.engine import make_machineless_step
 from drakerock.dynamics.nonsmooth.system import NonsmoothRocks
 from drakerock.errors import InputError, SimulationFailure
-from drakerock.pile.config import PileConfig, RocksConfig, SiteConfig
-from drakerock.pile.filling import fill
+from drakerock.pile.config import RocksConfig
 from drakerock.pile.shapes import load_rock_shapes
-from drakerock.pile.site import make_site
 from drakerock.pile.state import load_pile, save_pile
 from rock_helpers import draw_quaternion, make_ball, make_box, make_engine, make_pile, make_plane_site, run
 
@@ -285,25 +283,6 @@ def test_turning_is_the_exponential_map(vector, seed):
     turned = Rotation.from_quat(motion.turn(*q, *vector), scalar_first=True)
     expected = Rotation.from_rotvec(vector) * start
     assert (turned * expected.inv()).magnitude() < 1e-9
-
-
-def test_filling_stops_when_the_void_is_full():
-    site = SiteConfig(drift_width=2.5, void_depth=1.5, drift_height=2.0, roof_sag=0.1, void_height=8.0)
-    n = 260
-    rng = np.random.default_rng(0)
-    pile = make_pile(
-        np.tile([0.0, 0.0, -50.0], (n, 1)), shape=rng.integers(0, 6, n), size=rng.choice([0.3, 0.4], n),
-        quaternions=[draw_quaternion(rng) for _ in range(n)],
-    )  # fmt: skip
-    engine = make_engine(pile, SHAPES, make_site(site), config=NonsmoothConfig())
-    config = PileConfig(emission_height=1.6, batch_time=0.4, max_time=25.0, settle_speed=0.02)
-    filled, waiting = fill(engine, pile, np.arange(n), site, config, rng)
-    there = np.setdiff1d(np.arange(n), waiting)
-    assert 40 < len(there) < n
-    assert (filled.p_WRs[waiting, 2] < -40).all()
-    assert filled.p_WRs[there, 2].min() > 0.05
-    assert filled.p_WRs[there, 2].max() < 3.5
-    assert filled.contacts.resting[there].mean() > 0.9
 
 
 def test_another_piles_rocks_are_refused():
