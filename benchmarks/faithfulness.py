@@ -17,9 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from rocks import (
-    FILLING,
     ROCKS,
-    SHAPES,
     SITE,
     TIME_STEP,
     clear_way,
@@ -30,16 +28,15 @@ from rocks import (
 )
 from scipy import stats
 
-from drakerock.dynamics.config import NonsmoothConfig
-from drakerock.pile.config import SiteConfig
-from drakerock.pile.emission import sample_rocks
-from drakerock.pile.filling import fill
+from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
+from drakerock.dynamics.settling import PileRecipe, make_pile
+from drakerock.pile.config import PileConfig, SiteConfig
 from drakerock.pile.state import PileState
 
 # Per size of pile: number of rocks, site and emission height.
 SIZES = {
-    "300": (300, SiteConfig(drift_width=5.0, void_depth=1.2), 6.0),
-    "1000": (1000, SiteConfig(drift_width=6.5, void_depth=2.2), 6.0),
+    "300": (300, SiteConfig(drift_width=5.0, void_depth=1.2, rear_layer=0.0), 6.0),
+    "1000": (1000, SiteConfig(drift_width=6.5, void_depth=2.2, rear_layer=0.0), 6.0),
     "full": (0, SITE, 8.0),
 }
 VARIANTS: dict[str, tuple[dict[str, object], float]] = {
@@ -55,12 +52,14 @@ METRICS = ("bucket_mass_kg", "peak_push_kN", "mean_push_kN", "displaced_m3", "re
 
 
 def make_small_pile(n: int, site: SiteConfig, height: float, seed: int) -> PileState:
-    rng = np.random.default_rng(seed)
-    pile = sample_rocks(n, ROCKS, SHAPES, rng)
-    pile = replace(pile, p_WRs=np.tile([0.0, 0.0, -50.0], (n, 1)))
-    filling = FILLING.model_copy(update={"emission_height": height, "max_time": 40.0})
-    pile, waiting = fill(make_engine(pile, site), pile, np.arange(n), site, filling, rng)
-    pile = pile.select(np.setdiff1d(np.flatnonzero(pile.p_WRs[:, 2] > -1.0), waiting))
+    recipe = PileRecipe(
+        seed=seed,
+        site=site,
+        rocks=ROCKS,
+        pile=PileConfig(rocks=n, emission_height=height),
+        dynamics=DynamicsConfig(rocks="nonsmooth"),
+    )
+    pile = make_pile(recipe)
     # At rest with all awake: both variants start from the same true rest.
     engine = make_engine(pile, site, reduction="none")
     arrays = engine.make_arrays(pile)
