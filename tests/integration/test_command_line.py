@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from drakerock.loading.plan import DigPlan
+from drakerock.loading.scenario import load_scenario
 from drakerock.pile.state import load_pile
 
 COMMAND = Path(sys.executable).with_name("drakerock")
@@ -56,6 +57,7 @@ def test_load_writes_everything_it_says(place, loaded):
         "pile_before.npz",
         "pile_after.npz",
         "recording.npz",
+        "scenario.json",
         "replay.html",
     ]
     for name in names:
@@ -97,6 +99,52 @@ def test_pile_after_has_the_same_rocks_and_the_plan_is_readable(place, loaded):
     data = json.loads((place / "out" / "plan.json").read_text())
     plan = DigPlan.from_dict(data)
     assert plan.waypoint_x[4] < plan.waypoint_x[0]
+
+
+@pytest.fixture(scope="module")
+def sequence(place):
+    args = ["load", "small.yaml", "--set", "dynamics.rocks=nonsmooth", "--alpha", "0.4", "--out", "sequence"]
+    return [run(*args, *more, cwd=place) for more in (["--loadings", "1"], ["--loadings", "2", "--figures"])]
+
+
+def test_sequence_writes_loadings_and_summary_and_goes_on(place, sequence):
+    first, second = sequence
+    assert first.returncode == 0, first.stderr
+    assert second.returncode == 0, second.stderr
+    assert "standard error" in second.stdout
+    assert "wrote sequence/loading_01" in second.stdout
+    summary = json.loads((place / "sequence" / "sequence.json").read_text())
+    assert summary["loadings"] == 2
+    productions = [
+        json.loads((place / "sequence" / f"loading_0{k}" / "outcome.json").read_text())["objectives"][
+            "production"
+        ]
+        for k in (0, 1)
+    ]
+    row = summary["quantities"]["production"]
+    assert row["values"] == productions
+    assert row["mean"] == pytest.approx(np.mean(productions))
+    assert row["standard_error"] == pytest.approx(np.std(productions, ddof=1) / np.sqrt(2))
+
+
+def test_figures_and_resolved_scenario_are_written(place, sequence):
+    for number in (0, 1):
+        folder = place / "sequence" / f"loading_0{number}"
+        for name in ("height_field", "plan", "tip_path", "histories", "side", "top"):
+            assert (folder / f"figure_{name}.png").stat().st_size > 10_000
+        stored = load_scenario(folder / "scenario.json")
+        assert stored.loading.strategy.alpha == 0.4
+        assert stored.dynamics.rocks == "nonsmooth"
+
+
+def test_stored_plan_is_executed(place, sequence):
+    result = run(
+        "load", "sequence/loading_00/scenario.json", "--plan", "sequence/loading_01/plan.json", "--out", "planned",
+        "--json", cwd=place,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    other = json.loads((place / "sequence" / "loading_01" / "outcome.json").read_text())
+    assert json.loads(result.stdout)["plan"] == other["plan"]
 
 
 def test_replay_opens_without_network_and_can_be_made_anew(place, loaded):
@@ -151,6 +199,8 @@ def test_pile_command(place, loaded):
         (["load", "small.yaml", "--set", "rocks.shapes=[broken.sdf]"], ["rocks.shapes", "broken.sdf"]),
         (["load", "small.yaml", "--out", "small.yaml/x"], ["small.yaml/x", "cannot be written"]),
         (["pile", "small.yaml", "--set", "pile.emission_height=0.3"], ["pile.rocks", "emission_height"]),
+        (["load", "small.yaml", "--plan", "nothing.json"], ["nothing.json", "no such file"]),
+        (["load", "small.yaml", "--plan", "bad.yaml"], ["bad.yaml", "not a readable plan"]),
         (["replay", "nowhere"], ["nowhere", "no such file"]),
         (["machine", "check", "bad.yaml"], ["bad.yaml:2", "drift_widht"]),
     ],
