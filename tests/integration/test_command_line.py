@@ -11,7 +11,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from typer.testing import CliRunner
 
+from drakerock.cli import app
 from drakerock.loading.plan import DigPlan
 from drakerock.loading.scenario import load_scenario
 from drakerock.pile.state import load_pile
@@ -103,16 +105,22 @@ def test_pile_after_has_the_same_rocks_and_the_plan_is_readable(place, loaded):
 
 @pytest.fixture(scope="module")
 def sequence(place):
-    args = ["load", "small.yaml", "--set", "dynamics.rocks=nonsmooth", "--alpha", "0.4", "--out", "sequence"]
-    return [run(*args, *more, cwd=place) for more in (["--loadings", "1"], ["--loadings", "2", "--figures"])]
+    """A loading, then the same sequence asked to go on; in this process, whose kernels are compiled once."""
+    args = ["load", str(place / "small.yaml"), "--set", "dynamics.rocks=nonsmooth", "--alpha", "0.4"]
+    args += ["--out", str(place / "sequence")]
+    return [
+        CliRunner().invoke(app, [*args, *more])
+        for more in (["--loadings", "1"], ["--loadings", "2", "--figures"])
+    ]
 
 
 def test_sequence_writes_loadings_and_summary_and_goes_on(place, sequence):
     first, second = sequence
-    assert first.returncode == 0, first.stderr
-    assert second.returncode == 0, second.stderr
+    assert first.exit_code == 0, first.output
+    assert second.exit_code == 0, second.output
     assert "standard error" in second.stdout
-    assert "wrote sequence/loading_01" in second.stdout
+    assert "production [kg/s]" in second.stdout
+    assert f"wrote {place}/sequence/loading_01" in second.stdout
     summary = json.loads((place / "sequence" / "sequence.json").read_text())
     assert summary["loadings"] == 2
     productions = [
@@ -138,13 +146,16 @@ def test_figures_and_resolved_scenario_are_written(place, sequence):
 
 
 def test_stored_plan_is_executed(place, sequence):
-    result = run(
-        "load", "sequence/loading_00/scenario.json", "--plan", "sequence/loading_01/plan.json", "--out", "planned",
-        "--json", cwd=place,
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    other = json.loads((place / "sequence" / "loading_01" / "outcome.json").read_text())
-    assert json.loads(result.stdout)["plan"] == other["plan"]
+    first, second = (place / "sequence" / f"loading_0{k}" for k in (0, 1))
+    result = CliRunner().invoke(
+        app,
+        ["load", str(first / "scenario.json"), "--plan", str(second / "plan.json"), "--json"]
+        + ["--out", str(place / "planned")],
+    )
+    assert result.exit_code == 0, result.output
+    other = json.loads((second / "outcome.json").read_text())
+    outcome = json.loads((place / "planned" / "outcome.json").read_text())
+    assert outcome["plan"] == other["plan"]
 
 
 def test_replay_opens_without_network_and_can_be_made_anew(place, loaded):
