@@ -283,7 +283,7 @@ def _print_sequence(summary: dict[str, Any]) -> None:
             "-" if row[key] is None else form.format(row[key]) for key in ("mean", "standard_error", "spread")
         ]
         values = "  ".join("-" if value is None else form.format(value) for value in row["values"])
-        table.add_row(label, *numbers, values)
+        table.add_row(Text(label), *numbers, values)  # text, not markup: the units' brackets stay
     output.print(table)
 
 

@@ -11,8 +11,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from typer.testing import CliRunner
 
+from drakerock.cli import app
 from drakerock.loading.plan import DigPlan
+from drakerock.loading.scenario import load_scenario
 from drakerock.pile.state import load_pile
 
 COMMAND = Path(sys.executable).with_name("drakerock")
@@ -56,6 +59,7 @@ def test_load_writes_everything_it_says(place, loaded):
         "pile_before.npz",
         "pile_after.npz",
         "recording.npz",
+        "scenario.json",
         "replay.html",
     ]
     for name in names:
@@ -97,6 +101,61 @@ def test_pile_after_has_the_same_rocks_and_the_plan_is_readable(place, loaded):
     data = json.loads((place / "out" / "plan.json").read_text())
     plan = DigPlan.from_dict(data)
     assert plan.waypoint_x[4] < plan.waypoint_x[0]
+
+
+@pytest.fixture(scope="module")
+def sequence(place):
+    """A loading, then the same sequence asked to go on; in this process, whose kernels are compiled once."""
+    args = ["load", str(place / "small.yaml"), "--set", "dynamics.rocks=nonsmooth", "--alpha", "0.4"]
+    args += ["--out", str(place / "sequence")]
+    return [
+        CliRunner().invoke(app, [*args, *more])
+        for more in (["--loadings", "1"], ["--loadings", "2", "--figures"])
+    ]
+
+
+def test_sequence_writes_loadings_and_summary_and_goes_on(place, sequence):
+    first, second = sequence
+    assert first.exit_code == 0, first.output
+    assert second.exit_code == 0, second.output
+    assert "standard error" in second.stdout
+    assert "production [kg/s]" in second.stdout
+    assert f"wrote {place}/sequence/loading_01" in second.stdout
+    summary = json.loads((place / "sequence" / "sequence.json").read_text())
+    assert summary["loadings"] == 2
+    productions = [
+        json.loads((place / "sequence" / f"loading_0{k}" / "outcome.json").read_text())["objectives"][
+            "production"
+        ]
+        for k in (0, 1)
+    ]
+    row = summary["quantities"]["production"]
+    assert row["values"] == productions
+    assert row["mean"] == pytest.approx(np.mean(productions))
+    assert row["standard_error"] == pytest.approx(np.std(productions, ddof=1) / np.sqrt(2))
+
+
+def test_figures_and_resolved_scenario_are_written(place, sequence):
+    for number in (0, 1):
+        folder = place / "sequence" / f"loading_0{number}"
+        for name in ("height_field", "plan", "tip_path", "histories", "side", "top"):
+            assert (folder / f"figure_{name}.png").stat().st_size > 10_000
+        stored = load_scenario(folder / "scenario.json")
+        assert stored.loading.strategy.alpha == 0.4
+        assert stored.dynamics.rocks == "nonsmooth"
+
+
+def test_stored_plan_is_executed(place, sequence):
+    first, second = (place / "sequence" / f"loading_0{k}" for k in (0, 1))
+    result = CliRunner().invoke(
+        app,
+        ["load", str(first / "scenario.json"), "--plan", str(second / "plan.json"), "--json"]
+        + ["--out", str(place / "planned")],
+    )
+    assert result.exit_code == 0, result.output
+    other = json.loads((second / "outcome.json").read_text())
+    outcome = json.loads((place / "planned" / "outcome.json").read_text())
+    assert outcome["plan"] == other["plan"]
 
 
 def test_replay_opens_without_network_and_can_be_made_anew(place, loaded):
@@ -151,6 +210,8 @@ def test_pile_command(place, loaded):
         (["load", "small.yaml", "--set", "rocks.shapes=[broken.sdf]"], ["rocks.shapes", "broken.sdf"]),
         (["load", "small.yaml", "--out", "small.yaml/x"], ["small.yaml/x", "cannot be written"]),
         (["pile", "small.yaml", "--set", "pile.emission_height=0.3"], ["pile.rocks", "emission_height"]),
+        (["load", "small.yaml", "--plan", "nothing.json"], ["nothing.json", "no such file"]),
+        (["load", "small.yaml", "--plan", "bad.yaml"], ["bad.yaml", "not a readable plan"]),
         (["replay", "nowhere"], ["nowhere", "no such file"]),
         (["machine", "check", "bad.yaml"], ["bad.yaml:2", "drift_widht"]),
     ],

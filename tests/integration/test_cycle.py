@@ -6,6 +6,7 @@ from pydrake.systems.analysis import InitializeParams, Simulator
 
 from drakerock.loading.control import Mode
 from drakerock.loading.cycle import run_cycle
+from drakerock.loading.plan_file import save_plan
 from drakerock.loading.recording import load_recording, save_recording
 from drakerock.loading.signals import calc_signals
 from drakerock.loading.station import make_station
@@ -91,6 +92,88 @@ def test_recording_round_trip(result, tmp_path):
     assert np.array_equal(back.move_pose, result.recording.move_pose)
     assert back.notes == result.recording.notes
     assert len(back.visuals) == len(result.recording.visuals)
+
+
+def with_loading(scenario, **parts):
+    """The scenario with some keys of its loading's parts changed."""
+    loading = scenario.loading.model_copy(
+        update={name: getattr(scenario.loading, name).model_copy(update=keys) for name, keys in parts.items()}
+    )
+    dynamics = scenario.dynamics.model_copy(update={"rocks": "nonsmooth"})
+    return scenario.model_copy(update={"loading": loading, "dynamics": dynamics})
+
+
+def test_reaching_s4_is_a_reason(result):
+    assert result.outcome.reason == "s4 reached"
+    assert result.outcome.status == "done"
+
+
+def test_time_outs_are_events_and_the_last_one_a_reason(small_scenario, pile):
+    """A machine whose wheels hardly turn times out everywhere, and still counts with its real time."""
+    hurried = with_loading(
+        small_scenario, control={"timeout": 0.3, "approach_time": 1.0}, performance={"settle_time": 0.5}
+    )
+    weak = hurried.machine.model_copy(
+        update={"wheel": hurried.machine.wheel.model_copy(update={"effort": 10.0})}
+    )
+    outcome = run_cycle(hurried.model_copy(update={"machine": weak}), pile).outcome
+    assert outcome.reason == "s4 timed out"
+    assert outcome.status == "done"
+    times = {item["waypoint"]: item["time_s"] for item in outcome.events if item["event"] == "timeout"}
+    assert {"s0", "s1", "s4"} <= set(times)
+    assert times["s0"] == pytest.approx(1.0, abs=0.03)
+    assert times["s4"] == outcome.waypoint_times_s[4]
+    assert outcome.loading_time_s == pytest.approx(times["s4"] - times["s0"])
+    assert outcome.phi1 == pytest.approx(-outcome.bucket_mass_kg / outcome.loading_time_s)
+    assert any(item["event"] == "stall" for item in outcome.events)
+
+
+def test_wheels_without_grip_slip_as_an_event(small_scenario, pile):
+    site = small_scenario.site.model_copy(update={"friction": 0.02})
+    scenario = with_loading(small_scenario, control={"timeout": 0.3, "approach_time": 1.0})
+    outcome = run_cycle(scenario.model_copy(update={"site": site}), pile).outcome
+    slips = [item for item in outcome.events if item["event"] == "slip"]
+    assert slips
+    assert slips[0]["time_s"] < 0.5
+    assert slips[0]["duration_s"] > 0.2
+
+
+def test_drift_too_narrow_has_no_candidate_slice(small_scenario, pile):
+    wide = with_loading(small_scenario, planning={"wall_clearance": 0.6})
+    outcome = run_cycle(wide, pile).outcome
+    assert outcome.reason.startswith("no candidate slice: the machine")
+    assert outcome.status == "done"
+    assert outcome.phi1 == 0.0
+    assert outcome.steps == 0
+
+
+def test_scanner_sees_enough_to_dig(small_scenario, pile):
+    scenario = with_loading(small_scenario, sensing={"kind": "scanner"})
+    fields = []
+    for config in (scenario, scenario, with_loading(small_scenario), scenario.model_copy(update={"seed": 6})):
+        station = make_station(config, pile)
+        root = station.diagram.CreateDefaultContext()
+        station.rocks.set_pile(root, pile)
+        context = station.plant.GetMyMutableContextFromRoot(root)
+        set_machine_pose(station.plant, context, station.machine, x_tip=-8.0, z_tip=0.03)
+        fields.append(station.diagram.GetOutputPort("height_field").Eval(root).h)
+    scanned, again, ideal, reseeded = fields
+    assert np.array_equal(scanned, again)
+    assert not np.array_equal(scanned, reseeded)
+    assert np.abs(scanned - ideal).mean() < 0.1
+    outcome = run_cycle(scenario, pile).outcome
+    assert outcome.status == "done"
+    assert outcome.bucket_mass_kg > 0
+
+
+def test_stored_plan_is_driven_again(small_scenario, pile, result, tmp_path):
+    save_plan(result.plan, result.field, tmp_path / "plan.json")
+    source = {"planning": {"source": str(tmp_path / "plan.json")}, "strategy": {"alpha": 1.9}}
+    again = run_cycle(with_loading(small_scenario, **source), pile)
+    assert again.plan.to_dict() == result.plan.to_dict()
+    fresh = run_cycle(with_loading(small_scenario), pile)
+    assert again.outcome.phi1 == fresh.outcome.phi1
+    assert again.outcome.waypoint_times_s == fresh.outcome.waypoint_times_s
 
 
 def test_solver_failure_is_a_recorded_outcome(small_scenario, pile):

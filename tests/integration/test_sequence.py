@@ -3,8 +3,11 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
+from drakerock.dynamics.contact_graph import find_loose
 from drakerock.errors import InputError
 from drakerock.loading.sequence import run_sequence
+from drakerock.pile.config import RocksConfig
+from drakerock.pile.shapes import load_rock_shapes
 from drakerock.pile.state import load_pile
 
 N = 3
@@ -74,3 +77,22 @@ def test_folder_of_another_scenario_is_refused(scenario, straight):
     other = scenario.model_copy(update={"seed": 99})
     with pytest.raises(InputError, match="another scenario"):
         run_sequence(other, 1, folder)
+
+
+def test_a_failed_loading_is_the_last(scenario, tmp_path):
+    def fail_in_the_second(number, stage, time):
+        if number == 1 and stage != "refill" and time > 1.0:
+            raise RuntimeError("the solver failed to converge")
+
+    outcomes = run_sequence(scenario, N, tmp_path, progress=fail_in_the_second)
+    assert [item.status for item in outcomes] == ["done", "failed"]
+    assert not (tmp_path / "loading_02").exists()
+    # Resumed, it ends in the same place.
+    assert strip(run_sequence(scenario, N, tmp_path)) == strip(outcomes)
+
+
+def test_what_the_bucket_took_is_cleared_away_though_it_spilled(straight):
+    folder, _ = straight
+    pile = load_pile(folder / "loading_00" / "pile_next.npz")
+    loose = find_loose(pile, load_rock_shapes(RocksConfig().shapes), 0.005)
+    assert not np.any(loose & (pile.p_WRs[:, 0] < -4.0))

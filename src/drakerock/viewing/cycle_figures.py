@@ -38,6 +38,8 @@ _VIEWS = {"side": (0, 2, 1, -1.0), "top": (0, 1, 2, 1.0)}
 
 # The machine's side view keeps boom and cylinders, this far before the cut; side plates and wheels are farther out [m].
 CORE = 0.6
+# So much of the void is shown [m].
+BEHIND_BROW = 1.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +160,10 @@ def _mark_waypoints(ax: Axes, plan: DigPlan) -> None:
         seen.setdefault((round(float(x), 2), round(float(z), 2)), []).append(name)
     for (x, z), names in seen.items():
         ax.plot(x, z, "o", color="k", mfc="w", ms=6, zorder=5)
+        # s1 and s2 may be near each other: their labels go to different sides.
+        side = -17 if names == ["s1"] else 5
         ax.annotate(
-            ", ".join(names), (x, z), xytext=(5, 7), textcoords="offset points", fontsize=9, zorder=6,
+            ", ".join(names), (x, z), xytext=(side, 7), textcoords="offset points", fontsize=9, zorder=6,
             bbox={"boxstyle": "round,pad=0.1", "fc": "w", "ec": "none", "alpha": 0.8},
         )  # fmt: skip
 
@@ -325,7 +329,7 @@ def draw_image_sequence(
         draw_scene(ax, cycle.recording, frame, view, y_cut=y_cut)
         ax.set_title(f"{title}, {cycle.recording.times[frame]:.2f} s", fontsize=9, loc="left")
         if view == "side":
-            ax.set_xlim(start, site.void_depth + 0.2)
+            ax.set_xlim(start, min(site.void_depth + 0.2, BEHIND_BROW))
             ax.set_ylim(-0.3, site.drift_height + 0.7)
             ax.set_ylabel("z [m]")
         else:
@@ -394,7 +398,7 @@ def _make_plan_figure(cycle: StoredCycle, plan: DigPlan) -> Figure:
     draw_plan(ax, plan)
     draw_surface(ax, cycle.field, plan.y)
     site = cycle.recording.site
-    ax.set_xlim(float(plan.swept[:, 0].min()) - 1.0, site.void_depth + 0.2)
+    ax.set_xlim(float(plan.swept[:, 0].min()) - 1.0, min(site.void_depth + 0.2, BEHIND_BROW))
     ax.set_ylim(-0.3, site.drift_height + 0.7)
     ax.set_xlabel("x [m]")
     ax.set_ylabel("z [m]")
