@@ -187,7 +187,7 @@ def test_pile_command(place, loaded):
     result = run("pile", "small.yaml", "--out", "pile", "--json", cwd=place)
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["rocks"] <= 60
-    for name in ("pile.npz", "pile.json", "pile.png"):
+    for name in ("pile.npz", "pile.json", "pile.png", "pile.html"):
         assert (place / "pile" / name).stat().st_size > 0
 
 
