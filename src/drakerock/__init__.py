@@ -26,9 +26,12 @@ _LAZY: dict[str, str] = {
     "DigPlanner": "drakerock.loading.planning",
     "FeedforwardController": "drakerock.loading.control",
     "PileSensor": "drakerock.loading.sensing",
+    "Surrogate": "drakerock.exploration.surrogate",
+    "choose_strategy": "drakerock.exploration.strategy",
     "get_pile": "drakerock.study.jobs",
     "load_scenario": "drakerock.loading.scenario",
     "make_station": "drakerock.loading.station",
+    "pareto_front": "drakerock.exploration.pareto",
     "run_cycle": "drakerock.loading.cycle",
 }
 

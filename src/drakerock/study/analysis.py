@@ -1,0 +1,217 @@
+"""What a finished (or running) study says: report, confirmation, strategy. Functions, and their commands.
+
+A source is a study folder with an exported table (`responses.parquet` or `responses.csv`) and, where there is
+one, `study.json` beside it; or such a table alone. Of `study.json`, `problem` (variables and objectives),
+`exploration` (settings, an `ExplorationConfig`) and `seed` are used, and all of it is shown in the report.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pydantic import ValidationError
+
+from drakerock.errors import InputError
+from drakerock.exploration.analysis import ExplorationConfig, explore
+from drakerock.exploration.confirmation import Confirmation, Evaluate, confirm_points
+from drakerock.exploration.pareto import pareto_front, parse_bound, select_spread
+from drakerock.exploration.problem import Problem, format_number
+from drakerock.exploration.strategy import Strategy, choose_strategy, parse_weights
+from drakerock.exploration.surrogate import fit_surrogate
+from drakerock.exploration.table import ResponseTable
+
+_CONFIRMATION = "confirmation.json"
+
+
+def run_report(source: str | Path, out: str | Path | None = None) -> list[Path]:
+    """Write the report of a study or table; returns the written paths, report.html first.
+
+    Args:
+        source: study folder or table file.
+        out: folder to write into; None: `report` in the study folder, or beside the table.
+
+    Raises:
+        InputError: see `ResponseTable.load` and `explore`.
+    """
+    # matplotlib and plotly take a second to import: only who wants a report pays for it.
+    from drakerock.viewing.report import write_report
+
+    source = Path(source)
+    table, config, seed = _load(source)
+    folder = _find_folder(source)
+    confirmation = _read_confirmation(folder / _CONFIRMATION, table.problem)
+    name = table.provenance.get("name")
+    title = f"Exploration of {name}" if name else f"Exploration of {source.resolve().name}"
+    return write_report(
+        explore(table, config, seed, confirmation), Path(out) if out else folder / "report", title
+    )
+
+
+def run_strategy(
+    source: str | Path, weights: Mapping[str, float] | str | None = None, bounds: Sequence[str] = ()
+) -> Strategy:
+    """Return the Pareto-optimal strategy of a study or table for a trade-off.
+
+    Args:
+        source: study folder or table file.
+        weights: by objective, as a mapping or as text (``production=0.6,damage=0.4``); None: the knee point.
+        bounds: limits such as ``debris<=500``. The front is searched within them.
+
+    Raises:
+        InputError: see `parse_weights`, `parse_bound`, `pareto_front` and `choose_strategy`.
+    """
+    table, config, seed = _load(Path(source))
+    if isinstance(weights, str):
+        weights = parse_weights(weights, table.problem)
+    limits = [parse_bound(text, table.problem) for text in bounds]
+    surrogate = fit_surrogate(table, config.surrogate, seed)
+    return choose_strategy(pareto_front(surrogate, limits, config.pareto, seed), weights, limits)
+
+
+def run_confirm(source: str | Path, evaluate: Evaluate, n: int | None = None) -> Confirmation:
+    """Simulate points of the front again and store predicted against simulated in `confirmation.json`.
+
+    Args:
+        source: study folder or table file; `run_report` finds the result there.
+        evaluate: from a point (d,) to mean responses and standard errors (k,), in natural senses.
+        n: how many points: the knee, the best of each objective, then points spread between them. None: the
+            settings' `n_confirm`.
+
+    Raises:
+        InputError: see `ResponseTable.load` and `explore`; n below one.
+    """
+    if n is not None and n < 1:
+        raise InputError(f"confirm: asked for {n} points; ask for at least one")
+    table, config, seed = _load(Path(source))
+    surrogate = fit_surrogate(table, config.surrogate, seed)
+    front = pareto_front(surrogate, config=config.pareto, seed=seed)
+    chosen = select_spread(front, n or config.n_confirm, [choose_strategy(front).index])
+    confirmation = confirm_points(surrogate, front.X[chosen], evaluate)
+    path = _find_folder(Path(source)) / _CONFIRMATION
+    # Whole or not at all: a report may be made while this is written.
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(confirmation.to_rows(), indent=2) + "\n", encoding="utf-8")
+    part.replace(path)
+    return confirmation
+
+
+def add_commands(app: typer.Typer, study: typer.Typer, make_evaluate: Callable[[Path], Evaluate]) -> None:
+    """Add `strategy` to `app`, and `report` and `confirm` to its `study` group.
+
+    Args:
+        app: the program.
+        study: its group of study commands.
+        make_evaluate: from a study folder to the function that simulates a design point of that study.
+    """
+
+    @study.command("report")
+    def report(
+        source: Annotated[Path, typer.Argument(metavar="DIR", help="Study folder or response table.")],
+        out: Annotated[Path | None, typer.Option(help="Folder to write into [default: DIR/report].")] = None,
+    ) -> None:
+        """Fit, validate and explore; write one self-contained report.html with figures and numbers.
+
+        Example: drakerock study report out/paper
+        """
+        for path in run_report(source, out):
+            typer.echo(f"wrote {path}")
+
+    @study.command("confirm")
+    def confirm(
+        source: Annotated[Path, typer.Argument(metavar="DIR", help="Study folder.")],
+        points: Annotated[int | None, typer.Option(help="How many front points to simulate again.")] = None,
+        as_json: Annotated[bool, typer.Option("--json", help="Print only JSON.")] = False,
+    ) -> None:
+        """Simulate chosen Pareto points again: predicted against simulated.
+
+        Example: drakerock study confirm out/paper --points 5
+        """
+        confirmation = run_confirm(source, make_evaluate(source), points)
+        if as_json:
+            typer.echo(json.dumps(confirmation.to_rows(), indent=2))
+        else:
+            typer.echo(format_confirmation(confirmation))
+            typer.echo(f"wrote {_find_folder(source) / _CONFIRMATION}")
+
+    @app.command("strategy")
+    def strategy(
+        source: Annotated[Path, typer.Argument(metavar="DIR", help="Study folder or response table.")],
+        weights: Annotated[
+            str | None, typer.Option(help="Trade-off, such as production=0.6,damage=0.2,debris=0.2.")
+        ] = None,
+        bound: Annotated[
+            list[str] | None,
+            typer.Option("--bound", "--bounds", help="Limit, such as 'debris<=500'; repeatable."),
+        ] = None,
+        knee: Annotated[bool, typer.Option("--knee", help="The knee point (what no weights mean).")] = False,
+        as_json: Annotated[bool, typer.Option("--json", help="Print only JSON.")] = False,
+    ) -> None:
+        """Print the Pareto-optimal strategy for a trade-off.
+
+        Example: drakerock strategy out/paper --weights production=0.6,damage=0.2,debris=0.2
+        """
+        if knee and weights is not None:
+            raise InputError("--knee and --weights exclude each other")
+        limits = [part for text in bound or [] for part in text.split(",") if part.strip()]
+        chosen = run_strategy(source, weights, limits)
+        typer.echo(json.dumps(chosen.to_dict(), indent=2) if as_json else chosen.to_text())
+
+
+def format_confirmation(confirmation: Confirmation) -> str:
+    """Return predicted against simulated as text, one line per point and objective."""
+    problem = confirmation.problem
+    width = max(map(len, problem.objective_names))
+    lines = []
+    for i, x in enumerate(confirmation.X):
+        place = ", ".join(
+            f"{name} {value:.3f}" for name, value in zip(problem.variable_names, x, strict=True)
+        )
+        lines.append(f"point {i}: {place}")
+        if confirmation.failure[i]:
+            lines.append(f"  failed: {confirmation.failure[i]}")
+            continue
+        for j, name in enumerate(problem.objective_names):
+            predicted = _join(confirmation.predicted[i, j], confirmation.predicted_std[i, j])
+            simulated = _join(confirmation.simulated[i, j], confirmation.simulated_se[i, j])
+            z = format_number(confirmation.z[i, j], 2)
+            lines.append(f"  {name:<{width}}  predicted {predicted:<18}  simulated {simulated:<18}  z {z}")
+    return "\n".join(lines)
+
+
+def _join(value: float, spread: float) -> str:
+    return f"{format_number(value, 4)} +- {format_number(spread, 2)}"
+
+
+def _find_folder(source: Path) -> Path:
+    return source if source.is_dir() else source.parent
+
+
+def _load(source: Path) -> tuple[ResponseTable, ExplorationConfig, int]:
+    table = ResponseTable.load(source)
+    path = _find_folder(source) / "study.json"
+    try:
+        config = ExplorationConfig.model_validate(table.provenance.get("exploration", {}))
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in ("exploration", *first["loc"]))
+        raise InputError(f"{path}: {key}: {first['msg']}") from None
+    seed = table.provenance.get("seed", 0)
+    if not isinstance(seed, int) or seed < 0:
+        raise InputError(f"{path}: seed must be an integer >= 0, got {seed!r}")
+    return table, config, seed
+
+
+def _read_confirmation(path: Path, problem: Problem) -> Confirmation | None:
+    if not path.exists():
+        return None
+    try:
+        rows: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
+        return Confirmation.from_rows(problem, rows)
+    except (ValueError, InputError) as error:
+        raise InputError(
+            f"{path}: {error}; make it again with `drakerock study confirm`, or remove it"
+        ) from None

@@ -1,0 +1,140 @@
+import json
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import drakerock
+from drakerock.errors import InputError
+from drakerock.exploration.analysis import ExplorationConfig
+from drakerock.exploration.pareto import ParetoConfig
+from drakerock.exploration.problems import make_noisy_loading, make_noisy_table
+from drakerock.exploration.sensitivity import SensitivityConfig
+from drakerock.exploration.surrogate import SurrogateConfig
+from drakerock.study.analysis import add_commands, run_confirm, run_report, run_strategy
+
+KNOWN = make_noisy_loading()
+QUICK = ExplorationConfig(
+    surrogate=SurrogateConfig(n_starts=4),
+    pareto=ParetoConfig(population=60, evaluations=3000, n_draws=0),
+    sensitivity=SensitivityConfig(n_base=64),
+    n_confirm=4,
+)
+
+
+def evaluate(x):
+    return KNOWN.evaluate(x[None])[0], np.array([3.0, 0.03, 20.0])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("study")
+    rng = np.random.default_rng(0)
+    X = KNOWN.problem.unscale(rng.uniform(-1, 1, (70, 4)))
+    make_noisy_table(X, rng, n_validation=10).save(folder / "responses.csv")
+    study = {"name": "trial", "seed": 5, "exploration": QUICK.model_dump(mode="json")}
+    (folder / "study.json").write_text(json.dumps(study))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run():
+    app, study = typer.Typer(), typer.Typer()
+    add_commands(app, study, lambda path: evaluate)
+    app.add_typer(study, name="study")
+    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
+
+
+def test_strategy_as_text_and_json(folder, run):
+    words = ("strategy", folder, "--weights", "production=0.6,damage=0.2,debris=0.2")
+    text, data = run(*words), run(*words, "--json")
+    assert text.exit_code == data.exit_code == 0
+    parsed = json.loads(data.stdout)
+    assert parsed["objectives"]["production"] > 100.0
+    assert f"{parsed['strategy']['alpha']:.3f}" in text.stdout
+    expected = run_strategy(folder, {"production": 0.6, "damage": 0.2, "debris": 0.2})
+    assert parsed == json.loads(json.dumps(expected.to_dict()))
+
+
+def test_bounds_and_knee(folder, run):
+    bounded = json.loads(
+        run("strategy", folder, "--bound", "debris<=500", "--weights", "production=1", "--json").stdout
+    )
+    free = json.loads(run("strategy", folder, "--weights", "production=1", "--json").stdout)
+    assert bounded["objectives"]["debris"] <= 500.0 < free["objectives"]["debris"]
+    assert bounded["objectives"]["production"] < free["objectives"]["production"]
+    both = json.loads(run("strategy", folder, "--bounds", "debris<=600,damage<=1.2", "--json").stdout)
+    assert both["objectives"]["debris"] <= 600.0
+    assert both["objectives"]["damage"] <= 1.2
+    knee = json.loads(run("strategy", folder, "--knee", "--json").stdout)
+    assert knee == json.loads(run("strategy", folder, "--json").stdout)
+    assert knee["chosen_by"] == "knee point"
+
+
+def test_a_table_alone_will_do(folder, tmp_path):
+    path = tmp_path / "points.csv"
+    path.write_bytes((folder / "responses.csv").read_bytes())
+    assert run_strategy(path, "production=1").y[0] > 190.0
+
+
+def test_confirm_then_report(folder, run):
+    result = run("study", "confirm", folder, "--points", "3")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.count("point ") == 3
+    assert "predicted" in result.stdout
+    rows = json.loads((folder / "confirmation.json").read_text())
+    truth = KNOWN.evaluate(np.array([[rows[0][name] for name in KNOWN.problem.variable_names]]))[0]
+    assert rows[0]["production_simulated"] == pytest.approx(truth[0])
+    result = run("study", "report", folder)
+    assert result.exit_code == 0, result.output
+    assert "report.html" in result.stdout
+    page = (folder / "report" / "report.html").read_text(encoding="utf-8")
+    assert "<title>Exploration of trial</title>" in page
+    assert "Front points simulated again" in page
+    assert (folder / "report" / "figures" / "confirmation.pdf").exists()
+
+
+def test_confirm_takes_the_settings_number_and_keeps_failures(folder):
+    def fail(x):
+        raise ValueError("out of memory")
+
+    confirmation = run_confirm(folder, fail)
+    assert confirmation.failure == ("ValueError: out of memory",) * 4
+    run_confirm(folder, evaluate)
+    with pytest.raises(InputError, match="at least one"):
+        run_confirm(folder, evaluate, 0)
+
+
+def test_errors_name_file_and_key(tmp_path, folder):
+    with pytest.raises(InputError, match="no such file or folder"):
+        run_report(tmp_path / "nothing")
+    for name in ("responses.csv",):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    with pytest.raises(InputError, match="unknown objective 'speed'"):
+        run_strategy(tmp_path, "speed=1")
+    with pytest.raises(InputError, match="no strategy satisfies production>=900"):
+        run_strategy(folder, bounds=["production>=900"])
+    (tmp_path / "study.json").write_text(json.dumps({"exploration": {"pareto": {"population": 1}}}))
+    with pytest.raises(InputError, match=r"study\.json: exploration\.pareto\.population"):
+        run_strategy(tmp_path)
+    (tmp_path / "study.json").write_text(json.dumps({"seed": "x"}))
+    with pytest.raises(InputError, match="seed must be an integer"):
+        run_strategy(tmp_path)
+    (tmp_path / "study.json").write_text(json.dumps({"exploration": QUICK.model_dump(mode="json")}))
+    (tmp_path / "confirmation.json").write_text("[{}]")
+    with pytest.raises(InputError, match=r"confirmation\.json"):
+        run_report(tmp_path)
+
+
+def test_knee_and_weights_exclude_each_other(folder, run):
+    result = run("strategy", folder, "--knee", "--weights", "production=1")
+    assert isinstance(result.exception, InputError)
+
+
+def test_public_names():
+    from drakerock.exploration import pareto, strategy, surrogate
+
+    assert drakerock.Surrogate is surrogate.Surrogate
+    assert drakerock.pareto_front is pareto.pareto_front
+    assert drakerock.choose_strategy is strategy.choose_strategy

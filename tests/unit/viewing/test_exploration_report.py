@@ -1,0 +1,243 @@
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from drakerock.exploration.analysis import ExplorationConfig, explore
+from drakerock.exploration.confirmation import confirm_points
+from drakerock.exploration.pareto import ParetoConfig
+from drakerock.exploration.problem import Objective, Problem, Variable
+from drakerock.exploration.problems import make_noisy_loading, make_noisy_table
+from drakerock.exploration.sensitivity import SensitivityConfig
+from drakerock.exploration.strategy import choose_strategy
+from drakerock.exploration.surrogate import SurrogateConfig
+from drakerock.exploration.table import ResponseTable
+from drakerock.viewing.exploration_figures import draw_front, draw_nested_contours, make_figures, save_figures
+from drakerock.viewing.report import make_report, write_report
+
+QUICK = ExplorationConfig(
+    surrogate=SurrogateConfig(n_starts=4),
+    pareto=ParetoConfig(population=40, evaluations=1600, n_draws=8),
+    sensitivity=SensitivityConfig(n_base=64),
+)
+KNOWN = make_noisy_loading()
+
+
+def explore_noisy():
+    rng = np.random.default_rng(0)
+    X = KNOWN.problem.unscale(rng.uniform(-1, 1, (60, 4)))
+    table = make_noisy_table(X, rng, n_loadings=6, n_validation=12)
+    table = replace(
+        table,
+        replay=("replays/p000.html",) + ("",) * 59,
+        n_failed=(1,) + (0,) * 59,
+        failure=("stuck </script><b>at 3 s",) + ("",) * 59,
+        provenance={"name": "trial", "scenario_hash": "0123abcd"},
+    )
+    exploration = explore(table, QUICK)
+
+    def simulate(x):
+        if x[0] > 1.5:
+            raise RuntimeError("no")
+        return KNOWN.evaluate(x[None])[0], np.ones(3)
+
+    return replace(
+        exploration, confirmation=confirm_points(exploration.surrogate, exploration.front.X[:4], simulate)
+    )
+
+
+@pytest.fixture(scope="module")
+def exploration():
+    return explore_noisy()
+
+
+@pytest.fixture(scope="module")
+def written(exploration, tmp_path_factory):
+    return write_report(exploration, tmp_path_factory.mktemp("report"), "Trial <1>")
+
+
+class Links(HTMLParser):
+    """Collects everything a page would fetch, and its texts outside scripts."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.links, self.text, self._open = [], [], []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self._open.append(tag)
+        values = dict(attrs)
+        self.links += [values[key] for key in ("src", "href") if key in values]
+
+    def handle_endtag(self, tag):
+        while self._open and self._open.pop() != tag:
+            pass
+
+    def handle_data(self, data):
+        if not {"script", "style"} & set(self._open):
+            self.text.append(data)
+
+
+def test_report_needs_nothing_but_itself(written):
+    page = Links(written[0].read_text(encoding="utf-8"))
+    outside = [link for link in page.links if not link.startswith(("data:", "#"))]
+    assert outside == ["replays/p000.html"], "the one link outside is the replay of a point"
+    images = [link for link in page.links if link.startswith("data:image/png")]
+    assert len(images) == 9  # three maps, front, coverage, predicted, sensitivity, convergence, confirmation
+
+
+def test_report_tells_the_numbers(written, exploration):
+    text = " ".join(" ".join(Links(written[0].read_text(encoding="utf-8")).text).split())
+    knee = exploration.strategies["knee"]
+    assert "Trial <1>" in text
+    assert f"{knee.x[0]:.3f}" in text
+    assert f"{knee.y[0]:.4g}" in text
+    assert "stuck </script><b>at 3 s" in text, "reasons of failures are shown as they are, and are no HTML"
+    assert "0123abcd" in text
+    assert "RuntimeError: no" in text or all(exploration.confirmation.X[:, 0] <= 1.5)
+    assert "48 + 12" in text
+    assert "360" in text  # loadings
+    for name in KNOWN.problem.objective_names:
+        assert name in text
+    assert "nan" not in text.lower().split()
+
+
+def test_summary_and_front_are_the_exploration_s(written, exploration):
+    summary = json.loads(written[1].read_text())
+    assert summary["points"] == {"sample": 48, "validation": 12}
+    assert summary["loadings"] == {"run": 360, "failed": 1}
+    assert summary["strategies"]["knee"]["strategy"]["alpha"] == pytest.approx(
+        exploration.strategies["knee"].x[0]
+    )
+    data = np.genfromtxt(written[2], delimiter=",", names=True)
+    assert data["production"] == pytest.approx(exploration.front.Y[:, 0], rel=1e-6)
+    assert data["p_optimal"] == pytest.approx(exploration.front.uncertainty.p_optimal)
+
+
+def test_every_figure_is_there_as_png_and_pdf(written):
+    names = {path.name for path in written[3:]}
+    stems = {"contours_production", "contours_damage", "contours_debris", "pareto", "coverage", "predicted",
+             "sensitivity", "convergence", "confirmation"}  # fmt: skip
+    assert names == {f"{stem}.{suffix}" for stem in stems for suffix in ("png", "pdf")}
+    for path in written[3:]:
+        assert path.read_bytes()[:4] in (b"\x89PNG", b"%PDF")
+
+
+def test_equal_explorations_give_equal_bytes(exploration, written, tmp_path):
+    again = write_report(exploration, tmp_path, "Trial <1>")
+    for first, second in zip(written, again, strict=True):
+        assert first.read_bytes() == second.read_bytes(), first.name
+
+
+def find_browser():
+    return next(
+        (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))),
+        None,
+    )
+
+
+@pytest.mark.skipif(find_browser() is None, reason="no browser on this machine")
+def test_page_runs_in_a_browser_without_errors(written, exploration, tmp_path):
+    """The console stays free, and the page's own choice by weights is that of choose_strategy."""
+    command = [
+        find_browser(), "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
+        "--disable-component-update", "--disable-sync", f"--user-data-dir={tmp_path}",
+        "--enable-logging=stderr",
+        "--virtual-time-budget=5000", "--dump-dom", written[0].as_uri(),
+    ]  # fmt: skip
+    result = subprocess.run(command, capture_output=True, text=True, timeout=90)
+    console = [line for line in result.stderr.splitlines() if "CONSOLE" in line]
+    assert console == []
+    expected = choose_strategy(exploration.front, dict.fromkeys(KNOWN.problem.objective_names, 1.0))
+    shown = re.search(r'id="shown" data-index="(\d+)"', result.stdout)
+    assert shown
+    assert int(shown[1]) == expected.index
+    assert "main-svg" in result.stdout, "plotly drew the projections"
+
+
+@pytest.mark.parametrize(("d", "k"), [(1, 1), (2, 1), (3, 4), (10, 2)])
+def test_other_numbers_of_variables_and_objectives(tmp_path, d, k):
+    problem = Problem(
+        variables=tuple(Variable(name=f"x{i}", low=-1, high=1) for i in range(d)),
+        objectives=tuple(Objective(name=f"f{i}") for i in range(k)),
+    )
+    X = np.random.default_rng(0).uniform(-1, 1, (40, d))
+    Y = np.stack([((X - 0.5 * np.cos(i)) ** 2).sum(axis=1) for i in range(k)], axis=1)
+    exploration = explore(ResponseTable(problem, X, Y), QUICK)
+    paths = save_figures(make_figures(exploration), tmp_path, ["png"])
+    page = make_report(exploration, {path.stem: path.read_bytes() for path in paths}, "small")
+    assert ("pareto.png" in {p.name for p in paths}) == (k > 1)
+    assert exploration.references == {}
+    assert "leave-one-out NRMSE" in page
+
+
+def test_constant_and_missing_responses(tmp_path):
+    X = KNOWN.problem.unscale(np.random.default_rng(0).uniform(-1, 1, (30, 4)))
+    Y = KNOWN.evaluate(X)
+    Y[:, 1] = 0.0
+    Y[:4, 2] = np.nan
+    exploration = explore(ResponseTable(KNOWN.problem, X, Y), QUICK)
+    paths = save_figures(make_figures(exploration), tmp_path, ["png"])
+    page = make_report(exploration, {path.stem: path.read_bytes() for path in paths}, "odd")
+    assert "No failures" in page
+    assert exploration.sensitivity[1].total.max() == 0.0
+
+
+def test_nested_contours_show_the_right_cell():
+    """A response that depends on the outer variables only is flat in each cell and ordered between them."""
+    figure = Figure()
+    ax = figure.add_subplot()
+    drawn = []
+
+    def predict(X):
+        drawn.append(X.copy())
+        return np.column_stack([10 * X[:, 2] + X[:, 3], X[:, 0], X[:, 0]])
+
+    draw_nested_contours(ax, predict, KNOWN.problem, 0, np.full(4, 0.5), n_outer=3, n_inner=7)
+    assert len(drawn) == 9
+    X = np.concatenate(drawn)
+    assert X[:, 0].min() == pytest.approx(0.2)
+    assert X[:, 0].max() == pytest.approx(2.0)
+    assert sorted(np.unique(X[:, 2])) == pytest.approx([0.0, 0.5, 1.0])
+    # Within a cell alpha runs along x and beta along y.
+    first = drawn[0].reshape(7, 7, 4)
+    assert np.ptp(first[0, :, 0]) > 0
+    assert np.ptp(first[0, :, 1]) == 0
+    assert [t.get_text() for t in ax.get_xticklabels()] == ["0", "0.5", "1"]
+    assert "α 0.2 to 2" in ax.get_xlabel()
+
+
+def test_front_projection_shows_natural_values(exploration):
+    figure = Figure()
+    ax = figure.add_subplot()
+    draw_front(ax, exploration.front, (0, 2))
+    offsets = np.vstack([c.get_offsets() for c in ax.collections if c.get_label() == "front"])
+    assert np.array_equal(np.asarray(offsets), exploration.front.Y[:, [0, 2]])
+    assert ax.get_xlabel() == "production [kg/s]"
+    assert offsets[:, 0].min() > 0
+
+
+def test_maps_read_in_grey():
+    """Lightness of the colour map rises evenly from its first to its last colour."""
+    from matplotlib import colormaps
+
+    from drakerock.viewing.exploration_figures import COLORMAP
+
+    rgb = colormaps[COLORMAP](np.linspace(0, 1, 64))[:, :3]
+    luminance = rgb @ [0.2126, 0.7152, 0.0722]
+    assert np.all(np.diff(luminance) > 0)
+    assert np.ptp(luminance) > 0.6
+
+
+def test_figures_leave_no_global_state(exploration):
+    from matplotlib import pyplot
+
+    before = pyplot.get_fignums()
+    make_figures(exploration)
+    assert pyplot.get_fignums() == before
