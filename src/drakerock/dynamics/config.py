@@ -62,10 +62,10 @@ class NonsmoothConfig(Config):
     ] = 0.03
     contact_margin: Annotated[
         float, Field(gt=0, le=0.2, description="contacts are found this far ahead of touching [m]")
-    ] = 0.01
+    ] = 0.005
     manifold_gap: Annotated[
         float, Field(ge=0, le=0.2, description="corners of faces that touch count up to this gap [m]")
-    ] = 0.005
+    ] = 0.003
     face_cosine: Annotated[
         float, Field(gt=0, le=1, description="faces touch if this well aligned with the contact's normal")
     ] = 0.985

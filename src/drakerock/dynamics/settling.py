@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from platformdirs import user_cache_path
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.transform import Rotation
 
 import drakerock
 from drakerock.config import Config, calc_config_hash
@@ -136,8 +138,43 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
     shapes = load_rock_shapes(recipe.rocks.shapes)
     rng = make_generator(recipe.seed, "pile")
     waiting = sample_rocks(recipe.pile.rocks, recipe.rocks, shapes, rng)
-    total = len(waiting)
-    pile = make_empty_pile()
+    pile = drop_rocks(waiting, make_empty_pile(), shapes, recipe, rng, progress)
+    # The pile starts as a sequence leaves it after each loading: without loose rocks on the floor.
+    pile = pile.select(~find_loose(pile, shapes, recipe.pile.contact_gap))
+    provenance = {
+        "made_by": f"drakerock {drakerock.__version__}",
+        "recipe": calc_config_hash(recipe),
+        "seed": recipe.seed,
+    }
+    return replace(pile, provenance=provenance)
+
+
+def drop_rocks(
+    waiting: PileState,
+    pile: PileState,
+    shapes: tuple[RockShape, ...],
+    recipe: PileRecipe,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+) -> PileState:
+    """Emit rocks in batches from above onto a pile, and let all come to rest.
+
+    Args:
+        waiting: the rocks to emit, in this order; their turns are kept, their positions drawn.
+        pile: what is there already.
+        shapes: the rock shapes.
+        recipe: site, emission box, rest criterion, dynamics.
+        rng: source of the positions.
+        progress: called as things proceed.
+
+    Returns:
+        The pile at rest, the emitted rocks last, in the order in which they found room.
+
+    Raises:
+        InputError: the rocks do not fit under the emission height.
+        SimulationFailure: the dynamics failed, or the pile did not come to rest in time.
+    """
+    total = len(pile) + len(waiting)
     half = 0.5 * recipe.site.drift_width
     low = np.array([-recipe.pile.emission_reach, -half, 0.0])
     high = np.array([recipe.site.void_depth, half, recipe.pile.emission_height])
@@ -161,14 +198,37 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
     )
     if not resting:
         raise SimulationFailure(f"the pile did not come to rest within {recipe.pile.max_time:g} s")
-    # The pile starts as a sequence leaves it after each loading: without loose rocks on the floor.
-    pile = pile.select(~find_loose(pile, shapes, recipe.pile.contact_gap))
-    provenance = {
-        "made_by": f"drakerock {drakerock.__version__}",
-        "recipe": calc_config_hash(recipe),
-        "seed": recipe.seed,
-    }
-    return replace(pile, V_WRs=np.zeros_like(pile.V_WRs), provenance=provenance)
+    return replace(pile, V_WRs=np.zeros_like(pile.V_WRs))
+
+
+def refill(
+    pile: PileState,
+    removed: NDArray[np.bool_],
+    shapes: tuple[RockShape, ...],
+    recipe: PileRecipe,
+    rng: np.random.Generator,
+) -> PileState:
+    """Return the pile with the removed rocks emitted anew from above, so that its level is restored, at rest.
+
+    The new rocks have the removed ones' shapes and sizes, so that the gradation stays over a long sequence, and
+    new turns and places.
+
+    Args:
+        pile: all rocks, the removed ones among them.
+        removed: (n,) rocks taken away, in the bucket or as debris.
+        shapes: the rock shapes.
+        recipe: as in `drop_rocks`.
+        rng: source of the turns and places.
+
+    Raises:
+        SimulationFailure, InputError: as `drop_rocks`.
+    """
+    waiting = pile.select(removed)
+    turns = (
+        Rotation.random(len(waiting), rng=rng).as_quat(scalar_first=True) if len(waiting) else waiting.q_WRs
+    )
+    waiting = replace(waiting, q_WRs=turns, V_WRs=np.zeros((len(waiting), 6)))
+    return drop_rocks(waiting, pile.select(~removed), shapes, recipe, rng)
 
 
 def fetch_pile(recipe: PileRecipe, progress: Progress | None = None) -> tuple[PileState, Path]:

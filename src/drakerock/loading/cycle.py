@@ -85,6 +85,11 @@ class CycleOutcome:
     versions: dict[str, str]
     scenario_hash: str
 
+    @classmethod
+    def from_json(cls, text: str) -> CycleOutcome:
+        """Return the outcome that `to_json` wrote."""
+        return cls(**json.loads(text))
+
     def to_json(self) -> str:
         """Return the outcome as JSON text."""
         return json.dumps(asdict(self), indent=2, allow_nan=False) + "\n"
@@ -287,9 +292,11 @@ def make_folder(folder: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file; InputError if it cannot be written."""
+    """Write a text file, whole or not at all; InputError if it cannot be written."""
+    partial = path.with_name(path.name + ".partial")
     try:
-        path.write_text(text, encoding="utf-8")
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 

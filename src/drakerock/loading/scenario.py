@@ -10,6 +10,7 @@ from pydantic import Field
 
 from drakerock.config import Config, load_config
 from drakerock.dynamics.config import DynamicsConfig
+from drakerock.dynamics.settling import PileRecipe
 from drakerock.loading.config import LoadingConfig
 from drakerock.machine.config import MachineConfig
 from drakerock.pile.config import PileConfig, RocksConfig, SiteConfig
@@ -49,3 +50,14 @@ def load_scenario(path: str | Path | None = None, overrides: Sequence[str] = ())
         InputError: see `drakerock.config.load_config`.
     """
     return load_config(path or find_data("studies", "demo.yaml"), Scenario, overrides)
+
+
+def make_recipe(scenario: Scenario) -> PileRecipe:
+    """Return what the scenario's pile depends on."""
+    return PileRecipe(
+        seed=scenario.seed,
+        site=scenario.site,
+        rocks=scenario.rocks,
+        pile=scenario.pile,
+        dynamics=scenario.dynamics,
+    )

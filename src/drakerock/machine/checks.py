@@ -247,7 +247,8 @@ def _check_traction(shared: _Shared) -> list[CheckRow]:
     wall = Obstacle(Box(size, 20.0, size), (size / 2 + 0.02, 0.0, size / 2 + 0.02), 0.0)
     bench = shared.make(obstacle=wall)
     _place(bench, x_tip=0.0, **pose)
-    record = shared.run(bench, 2.5, wheel=kin.wheel_speed)
+    # Not for long: the push lowers the boom by its motor's compliance, and a bucket on the floor takes weight.
+    record = shared.run(bench, 1.5, wheel=kin.wheel_speed)
     late = record.time > record.time[-1] - 0.5
     push = record.tyre_force[late, :, 0].sum(axis=1).mean()
     normal = record.tyre_force[late, :, 2].sum(axis=1).mean()
@@ -456,7 +457,7 @@ def _check_free_flight(shared: _Shared) -> list[CheckRow]:
             bench,
             duration,
             boom=-0.5 * kin.boom_speed,
-            bucket=0.8 * kin.bucket_speed,
+            bucket=-0.8 * kin.bucket_speed,
             wheel=0.5 * kin.wheel_speed,
         )
         momentum_1, spin_1, energy_1 = _measure_motion(bench)
@@ -481,7 +482,7 @@ def _check_free_flight(shared: _Shared) -> list[CheckRow]:
                 "angular momentum afloat: error",
                 100 * float(np.linalg.norm(spin_1)) / (moved * reach),
                 "% of moved",
-                0.1,
+                0.5,
             ),
             _bound(
                 "energy less the motors' work: error",

@@ -55,7 +55,7 @@ def write_machine_page(config: MachineConfig, path: str | Path, *, contact_shape
 
     front = plant.GetBodyByName("front_unit", machine.instance)
     wheels = [plant.GetJointByName(joint, machine.instance) for joint in names.WHEEL_JOINTS]
-    eye = 3 * (kin.boom_length + kin.bucket_length)
+    eye = 2.2 * (kin.boom_length + kin.bucket_length)
     meshcat.SetCameraPose(
         np.array([0.65 * eye, 0.6 * eye, 0.35 * eye]), np.array([-0.1 * eye, 0.0, 0.08 * eye])
     )

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from drakerock.dynamics.settling import PileRecipe, fetch_pile
+from drakerock.dynamics.settling import fetch_pile
 from drakerock.loading.cycle import CycleOutcome, make_folder, run_cycle, save_cycle, write_text
-from drakerock.loading.scenario import Scenario
+from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.pile.shapes import load_rock_shapes
 from drakerock.pile.state import PileState, save_pile
 from drakerock.pile.summary import calc_summary
@@ -25,17 +25,6 @@ def get_pile(scenario: Scenario, progress: Callable[..., None] | None = None) ->
         SimulationFailure: the pile did not come to rest.
     """
     return fetch_pile(make_recipe(scenario), progress)[0]
-
-
-def make_recipe(scenario: Scenario) -> PileRecipe:
-    """Return what the scenario's pile depends on."""
-    return PileRecipe(
-        seed=scenario.seed,
-        site=scenario.site,
-        rocks=scenario.rocks,
-        pile=scenario.pile,
-        dynamics=scenario.dynamics,
-    )
 
 
 def run_and_save(

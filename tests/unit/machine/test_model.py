@@ -126,7 +126,7 @@ def test_missing_file_and_steering_out_of_range():
 
 
 def test_linkage_that_is_not_closed_is_refused(tmp_path, build):
-    file = write_sdf(tmp_path, (r"(<drake:ball_constraint_p_BQ>)-0.15 ", r"\1-2.15 "))
+    file = write_sdf(tmp_path, (r"(<drake:ball_constraint_p_BQ>)-0.136 ", r"\1-2.136 "))
     _, plant, _, machine = build(MachineConfig(model=file))
     with pytest.raises(InputError, match="isn't closed"):
         make_kinematics(plant, machine)

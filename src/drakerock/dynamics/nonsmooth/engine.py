@@ -237,6 +237,7 @@ class NonsmoothEngine:
         self._inverse_inertia = np.zeros((n, 6))
         self._posed = np.full((n, 7), np.nan)
         self._bodies = np.zeros((n + 1, solver.BODY_WIDTH))
+        self._bodies_32 = np.zeros((n + 1, solver.BODY_WIDTH), np.float32)
         self._velocities = np.zeros((n + 1 + self.n_machine_bodies, 6))
         self._marks = np.zeros(n + 1 + self.n_machine_bodies, np.int64)
         self._table = np.zeros(1 << int(np.ceil(np.log2(2 * self.capacity))), np.int64)
@@ -268,6 +269,8 @@ class NonsmoothEngine:
         self._row_key = np.zeros(capacity, np.int64)
         self._row_rock = np.zeros(capacity, np.int64)
         self._impacts = np.zeros((capacity, 3))
+        self._packed = np.zeros((capacity, solver.PACKED_WIDTH), np.float32)
+        self._packed_index = np.zeros((capacity, 3), np.int32)
 
     # ---- state in and out
 
@@ -445,10 +448,10 @@ class NonsmoothEngine:
             )  # fmt: skip
         motion.add_gravity(awake, self._bodies, np.array([0.0, 0.0, -self.gravity * dt]))
         velocity += machine.free_change
-        solver.apply_impulses(rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity)
         residual = solver.solve_resting(
-            rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, iterations
-        )
+            rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, iterations,
+            self._packed, self._packed_index, self._bodies_32,
+        )  # fmt: skip
 
         new = RockArrays(
             arrays.quaternions.copy(),

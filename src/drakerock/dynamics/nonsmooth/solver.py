@@ -54,6 +54,11 @@ MACHINE_ROW_WIDTH = 7
 # Below this overlap the contact stiffness is constant [m].
 MIN_OVERLAP = 1e-5
 
+# Rows in single precision: the first columns as in `contacts`, up to the impulses, then the tangential step.
+PACKED_TANGENT_STEP = 27
+PACKED_WIDTH = 28
+STREAMS = 4
+
 # Sweeps over the machine's own few, stiffly coupled rows per sweep over the contacts.
 MACHINE_SWEEPS = 4
 
@@ -318,6 +323,88 @@ def _solve_contact(row, body_a, body_b):
 
 
 @kernel
+def _solve_packed(rows, k, bodies, a, b):
+    """The same as `_solve_contact` in single precision, written out: this is where the time goes.
+
+    It takes arrays and indices: views of rows would be counted as references, which costs more than the rest.
+    """
+    zero = np.float32(0.0)
+    nx, ny, nz = rows[k, NORMAL], rows[k, NORMAL + 1], rows[k, NORMAL + 2]
+    ax, ay, az = rows[k, ARM_A], rows[k, ARM_A + 1], rows[k, ARM_A + 2]
+    bx, by, bz = rows[k, ARM_B], rows[k, ARM_B + 1], rows[k, ARM_B + 2]
+    w0, w1, w2, v0, v1, v2 = (
+        bodies[a, 0],
+        bodies[a, 1],
+        bodies[a, 2],
+        bodies[a, 3],
+        bodies[a, 4],
+        bodies[a, 5],
+    )
+    s0, s1, s2, u0, u1, u2 = (
+        bodies[b, 0],
+        bodies[b, 1],
+        bodies[b, 2],
+        bodies[b, 3],
+        bodies[b, 4],
+        bodies[b, 5],
+    )
+    dx = (u0 - v0) + (s1 * bz - s2 * by) + (w2 * ay - w1 * az)
+    dy = (u1 - v1) + (s2 * bx - s0 * bz) + (w0 * az - w2 * ax)
+    dz = (u2 - v2) + (s0 * by - s1 * bx) + (w1 * ax - w0 * ay)
+    old = rows[k, IMPULSE]
+    new = (
+        old - (nx * dx + ny * dy + nz * dz + rows[k, COMPLIANCE] * old - rows[k, BIAS]) * rows[k, NORMAL_MASS]
+    )
+    if new <= zero:
+        if old == zero:
+            return zero
+        new = zero
+    change = new - old
+    rows[k, IMPULSE] = new
+    tx, ty, tz = rows[k, TANGENT_1], rows[k, TANGENT_1 + 1], rows[k, TANGENT_1 + 2]
+    qx, qy, qz = rows[k, TANGENT_2], rows[k, TANGENT_2 + 1], rows[k, TANGENT_2 + 2]
+    slip_1 = tx * dx + ty * dy + tz * dz + rows[k, COUPLING_1] * change
+    slip_2 = qx * dx + qy * dy + qz * dz + rows[k, COUPLING_2] * change
+    old_1, old_2 = rows[k, IMPULSE + 1], rows[k, IMPULSE + 2]
+    new_1 = old_1 - (rows[k, TANGENT_MASS] * slip_1 + rows[k, TANGENT_MASS + 1] * slip_2)
+    new_2 = old_2 - (rows[k, TANGENT_MASS + 1] * slip_1 + rows[k, TANGENT_MASS + 2] * slip_2)
+    limit = rows[k, FRICTION] * new
+    size2 = new_1 * new_1 + new_2 * new_2
+    if size2 > limit * limit:
+        # see _solve_row
+        new_1 = old_1 - rows[k, PACKED_TANGENT_STEP] * slip_1
+        new_2 = old_2 - rows[k, PACKED_TANGENT_STEP] * slip_2
+        size2 = new_1 * new_1 + new_2 * new_2
+        if size2 > limit * limit:
+            factor = limit / np.sqrt(size2)
+            new_1 *= factor
+            new_2 *= factor
+    rows[k, IMPULSE + 1], rows[k, IMPULSE + 2] = new_1, new_2
+    new_1 -= old_1
+    new_2 -= old_2
+    px = nx * change + tx * new_1 + qx * new_2
+    py = ny * change + ty * new_1 + qy * new_2
+    pz = nz * change + tz * new_1 + qz * new_2
+    lx, ly, lz = ay * pz - az * py, az * px - ax * pz, ax * py - ay * px
+    mass = bodies[a, INVERSE_MASS]
+    bodies[a, 0] = w0 - (bodies[a, 7] * lx + bodies[a, 8] * ly + bodies[a, 9] * lz)
+    bodies[a, 1] = w1 - (bodies[a, 8] * lx + bodies[a, 10] * ly + bodies[a, 11] * lz)
+    bodies[a, 2] = w2 - (bodies[a, 9] * lx + bodies[a, 11] * ly + bodies[a, 12] * lz)
+    bodies[a, 3] = v0 - mass * px
+    bodies[a, 4] = v1 - mass * py
+    bodies[a, 5] = v2 - mass * pz
+    lx, ly, lz = by * pz - bz * py, bz * px - bx * pz, bx * py - by * px
+    mass = bodies[b, INVERSE_MASS]
+    bodies[b, 0] = s0 + (bodies[b, 7] * lx + bodies[b, 8] * ly + bodies[b, 9] * lz)
+    bodies[b, 1] = s1 + (bodies[b, 8] * lx + bodies[b, 10] * ly + bodies[b, 11] * lz)
+    bodies[b, 2] = s2 + (bodies[b, 9] * lx + bodies[b, 11] * ly + bodies[b, 12] * lz)
+    bodies[b, 3] = u0 + mass * px
+    bodies[b, 4] = u1 + mass * py
+    bodies[b, 5] = u2 + mass * pz
+    return change
+
+
+@kernel
 def _solve_machine_contacts(rows, order, body_a, body_b, bodies, n_rocks, machine, velocity):
     """Update the machine's contacts in `order`; return the sum of the changes of their normal impulses.
 
@@ -419,21 +506,55 @@ def _calc_impulse(row):
 
 
 @kernel
-def solve_resting(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity, iterations):
+def _pack(rows, n_rows, body_a, body_b, packed, index):
+    """Copy rows to single precision, in `STREAMS` interleaved streams.
+
+    Neighbours in the order then seldom share a body, and the processor works on several at a time. `index` is set
+    to (rows, 3): body A, body B, original row.
+    """
+    length = (n_rows + STREAMS - 1) // STREAMS
+    place = 0
+    for k in range(length):
+        for stream in range(STREAMS):
+            source = stream * length + k
+            if source < min(n_rows, (stream + 1) * length):
+                for d in range(IMPULSE + 3):
+                    packed[place, d] = rows[source, d]
+                packed[place, PACKED_TANGENT_STEP] = rows[source, TANGENT_STEP]
+                index[place, 0], index[place, 1], index[place, 2] = body_a[source], body_b[source], source
+                place += 1
+
+
+@kernel
+def solve_resting(
+    rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity, iterations, packed, index, bodies_32
+):
     """The resting stage: `iterations` symmetric sweeps, forwards and backwards in turn.
 
+    The sweeps over the rocks run in single precision; the velocities are then made anew from the impulses in
+    double precision, so that momentum is kept to rounding.
+
     Args:
-        rows, n_rows, body_a, body_b: prepared contact rows; the machine's are the last.
-        bodies, machine, velocity: with gravity, free velocities and warm start applied; changed.
+        rows, n_rows, body_a, body_b: prepared contact rows with the warm start's impulses; the machine's are the
+            last. Impulses are set.
+        bodies, machine, velocity: with gravity and free velocities, without the warm start; changed.
         n_rocks: see `prepare_rows`.
         iterations: number of sweeps.
+        packed, index, bodies_32: (rows, PACKED_WIDTH) and (n_rocks + 1, BODY_WIDTH) float32, (rows, 3) int32
+            scratch.
 
     Returns:
         the residual: the last sweep's change of the normal impulses over their sum.
     """
+    free = bodies.copy()
+    apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity)
+    for i in range(n_rocks + 1):
+        for d in range(INVERSE_INERTIA + 6):
+            bodies_32[i, d] = bodies[i, d]
     n_free = _find_machine_rows(n_rows, body_b, n_rocks)
     forwards = np.arange(n_free, n_rows)
     backwards = forwards[::-1].copy()
+    _pack(rows, n_free, body_a, body_b, packed, index)
     changed = 0.0
     for iteration in range(iterations):
         if len(machine.row_values) > 0:
@@ -441,16 +562,21 @@ def solve_resting(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, veloci
         changed = 0.0
         if iteration % 2 == 0:
             for k in range(n_free):
-                changed += abs(_solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]]))
+                changed += abs(_solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1]))
             changed += _solve_machine_contacts(
-                rows, forwards, body_a, body_b, bodies, n_rocks, machine, velocity
+                rows, forwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
             )
         else:
             changed += _solve_machine_contacts(
-                rows, backwards, body_a, body_b, bodies, n_rocks, machine, velocity
+                rows, backwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
             )
             for k in range(n_free - 1, -1, -1):
-                changed += abs(_solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]]))
+                changed += abs(_solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1]))
+    for k in range(n_free):
+        for d in range(3):
+            rows[index[k, 2], IMPULSE + d] = packed[k, IMPULSE + d]
+    bodies[:] = free
+    apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, np.zeros(len(velocity)))
     total = 0.0
     for k in range(n_rows):
         total += rows[k, IMPULSE]

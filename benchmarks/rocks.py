@@ -1,0 +1,315 @@
+"""Cost and quality of the nonsmooth rock engine at full size, one core.
+
+    OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python benchmarks/rocks.py all
+    ... benchmarks/rocks.py awake resting quality shallow deep shallow-none deep-none scaling
+
+The pile (about 5 500 moving rocks in a drift of 6.5 m) is filled on first use, kept in the user's cache folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
+
+from drakerock.dynamics.assembly import add_plant, add_site
+from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
+from drakerock.dynamics.nonsmooth.engine import NonsmoothEngine
+from drakerock.dynamics.nonsmooth.system import NonsmoothRocks, add_nonsmooth_rocks
+from drakerock.machine.config import MachineConfig
+from drakerock.machine.model import Machine, add_machine, calc_motor_targets
+from drakerock.machine.placement import set_machine_pose
+from drakerock.pile.config import PileConfig, RocksConfig, SiteConfig
+from drakerock.pile.emission import sample_rocks
+from drakerock.pile.filling import fill
+from drakerock.pile.shapes import load_rock_shapes
+from drakerock.pile.site import make_site
+from drakerock.pile.state import PileState, load_pile, save_pile
+
+ROCKS = RocksConfig()
+SHAPES = load_rock_shapes(ROCKS.shapes)
+SITE = SiteConfig(drift_width=6.5, void_depth=7.2)
+FILLING = PileConfig(
+    emission_height=8.0, batch_time=0.25, settle_speed=0.01, settle_window=0.5, max_time=150.0
+)
+TIME_STEP = 0.01
+
+
+def make_engine(pile: PileState, site: SiteConfig = SITE, **settings: object) -> NonsmoothEngine:
+    return NonsmoothEngine(
+        ROCKS,
+        SHAPES,
+        make_site(site),
+        NonsmoothConfig(**settings),
+        TIME_STEP,
+        pile.shape,
+        pile.size,
+        pile.fixed,
+    )
+
+
+def get_pile(seed: int = 0, n: int = 7500, site: SiteConfig = SITE) -> PileState:
+    """Return the benchmark's pile, filled and settled on first use (minutes)."""
+    folder = Path(platformdirs.user_cache_dir("drakerock")) / "benchmarks"
+    path = folder / f"pile-{site.drift_width:g}-{site.void_depth:g}-{n}-{seed}.npz"
+    if path.exists():
+        return load_pile(path)
+    rng = np.random.default_rng(seed)
+    pile = sample_rocks(n, ROCKS, SHAPES, rng)
+    pile = replace(pile, p_WRs=np.tile([0.0, 0.0, -50.0], (n, 1)))
+    engine = make_engine(pile, site)
+    start = time.perf_counter()
+
+    def report(t: float, waiting: int, step: object) -> None:
+        if round(t / TIME_STEP) % 500 == 0:
+            print(
+                f"  filling: {t:.0f} s, {waiting} waiting, {time.perf_counter() - start:.0f} s wall",
+                flush=True,
+            )
+
+    pile, waiting = fill(engine, pile, np.arange(n), site, FILLING, rng, report)
+    pile = pile.select(np.setdiff1d(np.flatnonzero(pile.p_WRs[:, 2] > -1.0), waiting))
+    folder.mkdir(parents=True, exist_ok=True)
+    save_pile(pile, path)
+    return pile
+
+
+def time_steps(engine: NonsmoothEngine, pile: PileState, n: int) -> tuple[PileState, float, list[object]]:
+    """Return the pile after n steps, the median CPU time of a step [s] and the reports."""
+    arrays = engine.make_arrays(pile)
+    times, reports = [], []
+    for _ in range(n):
+        start = time.process_time()
+        arrays, report = engine.advance(arrays)
+        times.append(time.process_time() - start)
+        reports.append(report)
+    return engine.make_pile(arrays), float(np.median(times[n // 10 :])), reports
+
+
+def bench_awake(pile: PileState) -> None:
+    """All rocks awake: cost per rock and step."""
+    engine = make_engine(pile, reduction="none")
+    for iterations in (20, 50, 150):
+        engine = make_engine(pile, reduction="none", iterations=iterations)
+        _, median, reports = time_steps(engine, pile, 60)
+        last = reports[-1]
+        print(
+            f"awake: {last.n_awake} rocks, {last.n_contacts} contacts ({last.n_loaded} loaded), {iterations} it: "
+            f"{median * 1e3:.1f} ms per step, {median / last.n_awake * 1e6:.1f} us per rock"
+        )
+
+
+def bench_resting(pile: PileState) -> None:
+    """300 rocks awake among resting ones; and none awake."""
+    engine = make_engine(pile)
+    resting = replace(pile.contacts, resting=np.ones(len(pile), bool))
+    for n_awake in (0, 300, 800, 2000):
+        flags = resting.resting.copy()
+        # a block around the middle of the slope
+        middle = np.argsort(np.linalg.norm(pile.p_WRs - [-1.0, 0.0, 2.0], axis=1))
+        flags[middle[:n_awake]] = False
+        start = replace(pile, contacts=replace(resting, resting=flags), V_WRs=np.zeros((len(pile), 6)))
+        # the count is held: neither waking nor resting
+        engine = make_engine(pile, rest={"wake_load": 1e9, "time": 1e9})
+        _, median, reports = time_steps(engine, start, 100)
+        print(f"resting: {reports[-1].n_awake} awake of {len(pile)}: {median * 1e3:.2f} ms per step")
+
+
+def bench_quality(pile: PileState) -> None:
+    """At rest with all awake: speed, penetration, creep."""
+    engine = make_engine(pile, reduction="none")
+    after, _, _ = time_steps(engine, pile, 250)
+    arrays = engine.make_arrays(after)
+    speeds, depths = [], []
+    for _ in range(250):
+        arrays, report = engine.advance(arrays)
+        speeds.append(np.sqrt((arrays.velocities[:, 3:] ** 2).sum(axis=1).mean()))
+        depths.append(report.p99_penetration)
+    final = engine.make_pile(arrays)
+    moved = np.linalg.norm(final.p_WRs - after.p_WRs, axis=1)
+    all_moved = np.linalg.norm(final.p_WRs - pile.p_WRs, axis=1)
+    print(
+        f"quality: rms speed {np.mean(speeds) * 1e3:.2f} mm/s, penetration p99 {np.mean(depths) * 1e3:.2f} mm, "
+        f"creep p50 / p99 {np.percentile(moved, 50) / 2.5e-3:.2f} / {np.percentile(moved, 99) / 2.5e-3:.2f} mm/s; "
+        f"in 5 s moved: mean {all_moved.mean() * 1e3:.2f} mm, p99 {np.percentile(all_moved, 99) * 1e3:.2f} mm"
+    )
+
+
+Rates = Callable[[float], tuple[float, float, float]]
+
+
+class _Motors(LeafSystem):
+    def __init__(self, machine_rates: Callable[[float], np.ndarray], size: int) -> None:
+        super().__init__()
+        self._rates = machine_rates
+        # Held over a step, as a digital controller's would be.
+        state = self.DeclareDiscreteState(size)
+        self.DeclareInitializationDiscreteUpdateEvent(self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(TIME_STEP, 0.0, self._update)
+        self.DeclareStateOutputPort("desired_state", state)
+
+    def _update(self, context: Context, state: object) -> None:
+        state.set_value(self._rates(context.get_time()))
+
+
+def make_dig(depth: float) -> Rates:
+    """Rates (wheels, boom, bucket) of a dig that drives `depth` [m] into the pile's toe, 12 s in all."""
+    drive = (1.0 + depth) / 1.2
+
+    def rates(t: float) -> tuple[float, float, float]:
+        if t < drive:
+            return 1.2 * min(t / 0.5, 1.0), 0.0, 0.0
+        if t < drive + 3.0:
+            return 0.35, -0.12, -0.13
+        if t < drive + 4.5:
+            return 0.0, 0.0, -0.35
+        return -1.0 * min((t - drive - 4.5) / 0.5, 1.0), 0.0, 0.0
+
+    return rates
+
+
+def find_toe(pile: PileState) -> float:
+    """Return where the pile begins on the machine's way [m]; single rocks before it are left out."""
+    low = pile.p_WRs[(np.abs(pile.p_WRs[:, 1]) < 1.5) & (pile.p_WRs[:, 2] < 0.6)]
+    return float(np.percentile(low[:, 0], 5))
+
+
+def clear_way(pile: PileState) -> PileState:
+    """Return the pile without the single rocks where the machine starts."""
+    return pile.select(np.flatnonzero(pile.p_WRs[:, 0] > find_toe(pile) - 0.5))
+
+
+def build_dig(
+    pile: PileState,
+    rates: Rates,
+    config: NonsmoothConfig,
+    time_step: float = TIME_STEP,
+    site: SiteConfig = SITE,
+) -> tuple[Simulator, object, Machine, NonsmoothRocks]:
+    """Return simulator, plant, machine and rocks of a dig, the bucket's tip 1 m before the toe."""
+    dynamics = DynamicsConfig(rocks="nonsmooth", nonsmooth=config, time_step=time_step)
+    builder = DiagramBuilder()
+    plant, scene_graph = add_plant(builder, dynamics)
+    built = make_site(site)
+    add_site(plant, built, dynamics)
+    machine = add_machine(plant, MachineConfig())
+    plant.Finalize()
+    rocks, view = add_nonsmooth_rocks(
+        builder, plant, scene_graph, machine, built, SHAPES, ROCKS, dynamics, pile
+    )
+    size = len(calc_motor_targets(plant, machine, 0.0, 0.0, 0.0))
+    motors = builder.AddSystem(_Motors(lambda t: calc_motor_targets(plant, machine, *rates(t)), size))
+    for port in (plant.get_desired_state_input_port(machine.instance), view.GetInputPort("desired_state")):
+        builder.Connect(motors.GetOutputPort("desired_state"), port)
+    simulator = Simulator(builder.Build())
+    context = simulator.get_mutable_context()
+    toe = find_toe(pile)
+    set_machine_pose(plant, plant.GetMyMutableContextFromRoot(context), machine, x_tip=toe - 1.0, z_tip=0.02)
+    simulator.Initialize()
+    return simulator, plant, machine, rocks
+
+
+def run_dig(
+    pile: PileState, rates: Rates, config: NonsmoothConfig, duration: float = 12.0, time_step: float = TIME_STEP,
+    site: SiteConfig = SITE,
+) -> dict[str, float]:  # fmt: skip
+    """Run a dig; return what it cost and did."""
+    pile = clear_way(pile)
+    simulator, plant, _machine, rocks = build_dig(pile, rates, config, time_step, site)
+    root = simulator.get_mutable_context()
+    context = rocks.GetMyContextFromRoot(root)
+    plant_context = plant.GetMyContextFromRoot(root)
+    bucket = plant.GetBodyByName("bucket")
+    rocks.get_report(root)  # loads the compiled kernels
+    n_steps = round(duration / time_step)
+    forces, summaries, fastest, redone = np.zeros((n_steps, 6)), np.zeros((n_steps, 6)), 0.0, 0
+    cpu = time.process_time()
+    for k in range(n_steps):
+        simulator.AdvanceTo((k + 1) * time_step)
+        forces[k] = rocks.GetOutputPort("F_B_W").Eval(context)
+        summaries[k] = rocks.GetOutputPort("rock_summary").Eval(context)
+        if k % 10 == 0:
+            fastest = max(fastest, float(np.abs(rocks.get_pile(root).V_WRs[:, 3:]).max()))
+    cpu = time.process_time() - cpu
+    after = rocks.get_pile(root)
+    X_WB = plant.EvalBodyPoseInWorld(plant_context, bucket)
+    local = (after.p_WRs - X_WB.translation()) @ X_WB.rotation().matrix()
+    inside = (
+        (local[:, 0] > -0.2) & (local[:, 0] < 2.1) & (np.abs(local[:, 1]) < 1.5)
+        & (local[:, 2] > -0.5) & (local[:, 2] < 2.3)
+    )  # fmt: skip
+    moved = np.linalg.norm(after.p_WRs - pile.p_WRs, axis=1)
+    masses = rocks.engine.mass
+    push = -forces[:, 3] * (np.arange(n_steps) * time_step < duration - 4.0)
+    return {
+        "cpu_s": cpu,
+        "bucket_mass_kg": float(masses[inside].sum()),
+        "peak_push_kN": float(push.max()) / 1e3,
+        "mean_push_kN": float(push[push > 1e3].mean()) / 1e3 if (push > 1e3).any() else 0.0,
+        "displaced_m3": float((masses * (moved > 0.05)).sum() / ROCKS.density),
+        "n_moved_5cm": float((moved > 0.05).sum()),
+        "awake_mean": float(summaries[:, 0].mean()),
+        "awake_max": float(summaries[:, 0].max()),
+        "penetration_max_mm": float(summaries[:, 2].max()) * 1e3,
+        "penetration_p99_mm": float(np.percentile(summaries[:, 3], 99)) * 1e3,
+        "residual_max": float(summaries[:, 4].max()),
+        "fastest_m_s": fastest,
+        "lost": float(summaries[-1, 5]),
+        "redone": float(redone),
+    }
+
+
+def bench_dig(pile: PileState, depth: float, reduction: str) -> None:
+    """A whole dig, machine included."""
+    result = run_dig(pile, make_dig(depth), NonsmoothConfig(reduction=reduction))
+    print(f"dig {depth:g} m, reduction {reduction}: " + ", ".join(f"{k} {v:.4g}" for k, v in result.items()))
+
+
+def bench_scaling(pile: PileState) -> None:
+    """The same shallow dig with the pile's void four times as full of rocks behind it."""
+    site = SiteConfig(drift_width=6.5, void_depth=7.2 + 3 * 9.0)
+    copies = [pile]
+    deep = pile.p_WRs[:, 0] > 0.6
+    block = pile.select(deep)
+    for k in range(1, 6):
+        copies.append(replace(block, p_WRs=block.p_WRs + [5.0 * k + 2.0 * (k > 0), 0, 0]))
+    total = copies[0]
+    for item in copies[1:]:
+        total = total.join(item)
+    for name, rocks, where in (("one", pile, SITE), ("many", total, site)):
+        result = run_dig(rocks, make_dig(1.0), NonsmoothConfig(), site=where)
+        print(f"scaling: {name}, {len(rocks)} rocks: " + ", ".join(f"{k} {v:.4g}" for k, v in result.items()))
+
+
+CASES: dict[str, Callable[[PileState], None]] = {
+    "awake": bench_awake,
+    "resting": bench_resting,
+    "quality": bench_quality,
+    "shallow": lambda pile: bench_dig(pile, 1.0, "rest"),
+    "deep": lambda pile: bench_dig(pile, 3.5, "rest"),
+    "shallow-none": lambda pile: bench_dig(pile, 1.0, "none"),
+    "deep-none": lambda pile: bench_dig(pile, 3.5, "none"),
+    "scaling": bench_scaling,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("cases", nargs="+", choices=[*CASES, "all"])
+    parser.add_argument("--pile", type=Path, help="a stored pile to take instead")
+    arguments = parser.parse_args()
+    pile = load_pile(arguments.pile) if arguments.pile else get_pile()
+    print(f"pile: {len(pile)} rocks")
+    for case in CASES if "all" in arguments.cases else arguments.cases:
+        CASES[case](pile)
+
+
+if __name__ == "__main__":
+    main()

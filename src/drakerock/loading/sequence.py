@@ -1,0 +1,111 @@
+"""A sequence: loadings one after the other from one pile (method section 5, a sequence)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from drakerock.config import calc_config_hash
+from drakerock.dynamics.settling import fetch_pile, refill
+from drakerock.errors import InputError, SimulationFailure
+from drakerock.loading.cycle import CycleOutcome, CycleResult, make_folder, run_cycle, save_cycle
+from drakerock.loading.scenario import Scenario, make_recipe
+from drakerock.pile.shapes import load_rock_shapes
+from drakerock.pile.state import PileState, load_pile, save_pile
+from drakerock.randomness import make_generator
+
+SequenceProgress = Callable[[int, str, float], None]
+"""Called with the loading's number, what is being done, and the simulated time [s]."""
+
+NEXT_PILE = "pile_next.npz"
+
+
+def run_sequence(
+    scenario: Scenario, n_loadings: int, folder: Path, *, progress: SequenceProgress | None = None
+) -> list[CycleOutcome]:
+    """Run loadings from the scenario's pile: weigh, clean, refill, relax, sense and plan anew.
+
+    Each loading has its own subfolder, whose ``outcome.json`` is written last and at once, after the pile that
+    the next loading starts from. Called again with the same folder, the sequence goes on after the last
+    complete loading, and ends with the same outcomes, bit for bit, as one that was never interrupted. After a
+    failed loading the next one starts from the same pile.
+
+    Args:
+        scenario: the configuration; its seed also seeds the refills.
+        n_loadings: how many.
+        folder: where the loadings' subfolders are.
+        progress: called as things proceed.
+
+    Raises:
+        InputError: bad configuration, a folder that cannot be written or that holds another sequence.
+        SimulationFailure: the pile could not be made or refilled.
+    """
+    make_folder(folder)
+    pile, _ = fetch_pile(make_recipe(scenario))
+    identity = calc_config_hash(scenario)
+    outcomes = []
+    for number in range(n_loadings):
+        place = folder / f"loading_{number:02d}"
+        done = _read_loading(place, identity)
+        if done is None:
+            done = _run_loading(scenario, pile, number, place, progress)
+        outcome, pile = done
+        outcomes.append(outcome)
+    return outcomes
+
+
+def _read_loading(place: Path, identity: str) -> tuple[CycleOutcome, PileState] | None:
+    path = place / "outcome.json"
+    if not path.exists():
+        return None
+    try:
+        outcome = CycleOutcome.from_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError):
+        raise InputError(
+            f"{path}: not a readable outcome; remove {place} to run this loading again"
+        ) from None
+    if outcome.scenario_hash != identity:
+        raise InputError(
+            f"{path}: of another scenario ({outcome.scenario_hash}, not {identity}); take another folder"
+        )
+    return outcome, load_pile(place / NEXT_PILE)
+
+
+def _run_loading(
+    scenario: Scenario, pile: PileState, number: int, place: Path, progress: SequenceProgress | None
+) -> tuple[CycleOutcome, PileState]:
+    def tell(stage: str, time: float) -> None:
+        if progress:
+            progress(number, stage, time)
+
+    result = run_cycle(scenario, pile, lambda mode, time: tell(mode.lower(), time))
+    tell("refill", result.outcome.sim_time_s)
+    following = make_next_pile(scenario, result, number)
+    make_folder(place)
+    save_pile(following, place / NEXT_PILE)
+    save_cycle(result, place)
+    return result.outcome, following
+
+
+def make_next_pile(scenario: Scenario, result: CycleResult, number: int) -> PileState:
+    """Return the pile for the next loading: bucket emptied, debris removed, void refilled, all at rest.
+
+    Args:
+        scenario: the configuration.
+        result: the loading's.
+        number: of the loading, from 0; with the scenario's seed it seeds the refill.
+
+    Raises:
+        SimulationFailure: the refilled pile did not come to rest.
+    """
+    if result.outcome.status == "failed":
+        return result.pile_before
+    removed = result.in_bucket | result.debris
+    rng = make_generator(scenario.seed, "refill", number)
+    shapes = load_rock_shapes(scenario.rocks.shapes)
+    following = refill(result.pile_after, removed, shapes, make_recipe(scenario), rng)
+    if not np.all(np.isfinite(following.p_WRs)):
+        raise SimulationFailure(f"the refill after loading {number} is not finite")
+    return following

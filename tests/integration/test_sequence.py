@@ -1,0 +1,76 @@
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from drakerock.errors import InputError
+from drakerock.loading.sequence import run_sequence
+from drakerock.pile.state import load_pile
+
+N = 3
+
+
+def strip(outcomes):
+    return [
+        {k: v for k, v in asdict(item).items() if k not in ("wall_time_s", "ms_per_step")}
+        for item in outcomes
+    ]
+
+
+@pytest.fixture(scope="module")
+def scenario(small_scenario):
+    dynamics = small_scenario.dynamics.model_copy(update={"rocks": "nonsmooth"})
+    return small_scenario.model_copy(update={"dynamics": dynamics})
+
+
+@pytest.fixture(scope="module")
+def straight(scenario, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("straight")
+    return folder, run_sequence(scenario, N, folder)
+
+
+def test_rocks_are_neither_lost_nor_made(straight):
+    folder, outcomes = straight
+    assert len(outcomes) == N
+    before = load_pile(folder / "loading_00" / "pile_before.npz")
+    for number in range(N):
+        pile = load_pile(folder / f"loading_{number:02d}" / "pile_next.npz")
+        assert np.array_equal(np.sort(pile.size), np.sort(before.size))
+        assert np.array_equal(np.sort(pile.shape), np.sort(before.shape))
+        assert pile.p_WRs[:, 2].min() > 0
+
+
+def test_each_loading_starts_from_the_refilled_pile(straight):
+    folder, _ = straight
+    for number in range(N - 1):
+        following = load_pile(folder / f"loading_{number:02d}" / "pile_next.npz")
+        start = load_pile(folder / f"loading_{number + 1:02d}" / "pile_before.npz")
+        assert np.array_equal(following.p_WRs, start.p_WRs)
+
+
+def test_interrupted_sequence_ends_with_the_same_bits(scenario, straight, tmp_path):
+    class Stop(Exception):
+        pass
+
+    def stop_in_the_second(number, stage, time):
+        if number == 1 and time > 1.0:
+            raise Stop
+
+    with pytest.raises(Stop):
+        run_sequence(scenario, N, tmp_path, progress=stop_in_the_second)
+    assert (tmp_path / "loading_00" / "outcome.json").exists()
+    assert not (tmp_path / "loading_01" / "outcome.json").exists()
+    stamp = (tmp_path / "loading_00" / "outcome.json").stat().st_mtime_ns
+    outcomes = run_sequence(scenario, N, tmp_path)
+    assert (tmp_path / "loading_00" / "outcome.json").stat().st_mtime_ns == stamp
+    folder, expected = straight
+    assert strip(outcomes) == strip(expected)
+    last = f"loading_{N - 1:02d}/pile_next.npz"
+    assert np.array_equal(load_pile(tmp_path / last).p_WRs, load_pile(folder / last).p_WRs)
+
+
+def test_folder_of_another_scenario_is_refused(scenario, straight):
+    folder, _ = straight
+    other = scenario.model_copy(update={"seed": 99})
+    with pytest.raises(InputError, match="another scenario"):
+        run_sequence(other, 1, folder)
