@@ -100,14 +100,16 @@ class DaskExecutor(Executor):
         name: for people.
         client: a `distributed.Client`.
         cluster: the cluster to close at the end; None for one that others own.
+        wanted: local workers to be kept up; 0: that is the cluster's own business.
     """
 
-    def __init__(self, name: str, client: Any, cluster: Any = None) -> None:
+    def __init__(self, name: str, client: Any, cluster: Any = None, wanted: int = 0) -> None:
         self.name = name
         self.dashboard = client.dashboard_link or ""
         self._client, self._cluster = client, cluster
         self._futures: dict[Any, Task] = {}
         self._n_workers, self._counted = 0, -1e9
+        self._wanted = wanted
 
     @property
     def n_workers(self) -> int:
@@ -116,8 +118,17 @@ class DaskExecutor(Executor):
             # A scheduler that is gone shows in the futures.
             with suppress(OSError, TimeoutError, RuntimeError):
                 self._n_workers = len(self._client.nthreads())
+            self._replace_lost()
             self._counted = time.monotonic()
         return self._n_workers
+
+    def _replace_lost(self) -> None:
+        """Have new workers started for those that Dask has given up, as it does with one that starts too slowly."""
+        if self._wanted:
+            nannies = list(self._cluster.workers.values())
+            ended = sum(str(nanny.status) in ("Status.closed", "Status.failed") for nanny in nannies)
+            if len(nannies) - ended < self._wanted:
+                self._cluster.scale(self._wanted + ended)
 
     def submit(self, task: Task) -> None:
         """Take in a task."""
@@ -255,10 +266,10 @@ def _start_local(workers: int, memory_limit: str) -> DaskExecutor:
             preload=["drakerock.study.worker_setup"],
             silence_logs=logging.CRITICAL,
         )
-    return _use("this machine", cluster)
+    return _use("this machine", cluster, workers)
 
 
-def _use(name: str, cluster: Any) -> DaskExecutor:
+def _use(name: str, cluster: Any, wanted: int = 0) -> DaskExecutor:
     from distributed import Client
 
-    return DaskExecutor(name, Client(cluster, name="drakerock"), cluster)
+    return DaskExecutor(name, Client(cluster, name="drakerock"), cluster, wanted)
