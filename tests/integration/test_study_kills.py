@@ -182,7 +182,7 @@ def kill_workers(place, reference, n_kills, seed):
 
 
 def test_kill_9_of_workers(place, reference):
-    assert kill_workers(place, reference, n_kills=10, seed=2) == 10
+    assert kill_workers(place, reference, n_kills=3, seed=2) == 3
 
 
 @pytest.mark.slow
@@ -270,6 +270,7 @@ def test_ctrl_c_once_lets_the_running_cycles_finish(place, reference):
     assert place.check(reference, 0) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("signals", "code"), [([signal.SIGINT] * 2, 130), ([signal.SIGTERM], 143)])
 def test_ctrl_c_twice_and_sigterm_stop_at_once(place, signals, code):
     process = place.start("--workers", "2", STUDY_WORK_SECONDS="30")
@@ -285,6 +286,7 @@ def test_ctrl_c_twice_and_sigterm_stop_at_once(place, signals, code):
     assert not [pid for pid in workers if Path(f"/proc/{pid}").exists()]
 
 
+@pytest.mark.slow
 def test_workers_end_with_a_killed_main_process(place):
     process = place.start("--workers", "2", STUDY_WORK_SECONDS="30")
     place.wait_for(2, "start")
@@ -297,6 +299,7 @@ def test_workers_end_with_a_killed_main_process(place):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "setting"), [("die", []), ("memory", ["--set", "executor.memory_limit=600MB"])]
 )
@@ -314,7 +317,8 @@ def test_a_point_that_kills_its_worker_is_marked(place, mode, setting):
     assert bad
     assert {item["point"] for item in status["points_failed"]} == bad
     assert all("worker died" in item["reason"] for item in status["points_failed"])
-    assert status["worker_deaths"] == 2 * len(bad)
+    # More than two each, if one took a task along that waited for it.
+    assert status["worker_deaths"] >= 2 * len(bad)
     assert status["points"]["done"] == 8 - len(bad)
 
 
@@ -335,6 +339,7 @@ def stop(process):
     process.communicate()
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler(place, reference):
     """On a cluster of others: the scheduler dies, the run says so; with a new one it goes on."""
     scheduler, address = start_cluster(place.folder, "scheduler", "--port", "0", "--no-dashboard")
