@@ -1,9 +1,9 @@
 """Cost and quality of the nonsmooth rock engine at full size, one core.
 
     OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python benchmarks/rocks.py all
-    ... benchmarks/rocks.py awake resting quality shallow deep shallow-none deep-none scaling
+    ... benchmarks/rocks.py awake resting quality woken shallow deep shallow-none deep-none scaling
 
-The pile (about 5 500 moving rocks in a drift of 6.5 m) is filled on first use, kept in the user's cache folder.
+The pile is the default scenario's, about 5 500 moving rocks in a drift of 6.5 m.
 """
 
 from __future__ import annotations
@@ -15,30 +15,27 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import platformdirs
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
 from drakerock.dynamics.assembly import add_plant, add_site
 from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
+from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.nonsmooth.engine import NonsmoothEngine
 from drakerock.dynamics.nonsmooth.system import NonsmoothRocks, add_nonsmooth_rocks
+from drakerock.dynamics.settling import fetch_pile
+from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.machine.config import MachineConfig
 from drakerock.machine.model import Machine, add_machine, calc_motor_targets
 from drakerock.machine.placement import set_machine_pose
-from drakerock.pile.config import PileConfig, RocksConfig, SiteConfig
-from drakerock.pile.emission import sample_rocks
-from drakerock.pile.filling import fill
+from drakerock.pile.config import RocksConfig, SiteConfig
 from drakerock.pile.shapes import load_rock_shapes
 from drakerock.pile.site import make_site
-from drakerock.pile.state import PileState, load_pile, save_pile
+from drakerock.pile.state import PileState, load_pile
 
 ROCKS = RocksConfig()
 SHAPES = load_rock_shapes(ROCKS.shapes)
-SITE = SiteConfig(drift_width=6.5, void_depth=7.2)
-FILLING = PileConfig(
-    emission_height=8.0, batch_time=0.25, settle_speed=0.01, settle_window=0.5, max_time=150.0
-)
+SITE = SiteConfig()
 TIME_STEP = 0.01
 
 
@@ -55,30 +52,9 @@ def make_engine(pile: PileState, site: SiteConfig = SITE, **settings: object) ->
     )
 
 
-def get_pile(seed: int = 0, n: int = 7500, site: SiteConfig = SITE) -> PileState:
-    """Return the benchmark's pile, filled and settled on first use (minutes)."""
-    folder = Path(platformdirs.user_cache_dir("drakerock")) / "benchmarks"
-    path = folder / f"pile-{site.drift_width:g}-{site.void_depth:g}-{n}-{seed}.npz"
-    if path.exists():
-        return load_pile(path)
-    rng = np.random.default_rng(seed)
-    pile = sample_rocks(n, ROCKS, SHAPES, rng)
-    pile = replace(pile, p_WRs=np.tile([0.0, 0.0, -50.0], (n, 1)))
-    engine = make_engine(pile, site)
-    start = time.perf_counter()
-
-    def report(t: float, waiting: int, step: object) -> None:
-        if round(t / TIME_STEP) % 500 == 0:
-            print(
-                f"  filling: {t:.0f} s, {waiting} waiting, {time.perf_counter() - start:.0f} s wall",
-                flush=True,
-            )
-
-    pile, waiting = fill(engine, pile, np.arange(n), site, FILLING, rng, report)
-    pile = pile.select(np.setdiff1d(np.flatnonzero(pile.p_WRs[:, 2] > -1.0), waiting))
-    folder.mkdir(parents=True, exist_ok=True)
-    save_pile(pile, path)
-    return pile
+def get_pile() -> PileState:
+    """Return the default scenario's pile; made on first use (a minute) if it is not the shipped one."""
+    return fetch_pile(make_recipe(Scenario()))[0]
 
 
 def time_steps(engine: NonsmoothEngine, pile: PileState, n: int) -> tuple[PileState, float, list[object]]:
@@ -122,6 +98,21 @@ def bench_resting(pile: PileState) -> None:
         print(f"resting: {reports[-1].n_awake} awake of {len(pile)}: {median * 1e3:.2f} ms per step")
 
 
+def bench_woken(pile: PileState) -> None:
+    """300 rocks woken inside the stored pile, 5 s without a machine."""
+    resting = np.ones(len(pile), bool)
+    chosen = np.argsort(np.linalg.norm(pile.p_WRs - [1.5, 0.0, 2.0], axis=1))[:300]
+    resting[chosen] = False
+    start = replace(pile, contacts=replace(pile.contacts, resting=resting), V_WRs=np.zeros((len(pile), 6)))
+    after, _, reports = time_steps(make_engine(start), start, 500)
+    moved = np.linalg.norm(after.p_WRs - start.p_WRs, axis=1)
+    print(
+        f"woken: of 300 rocks, mean displacement {moved[chosen].mean() * 1e3:.2f} mm, "
+        f"p99 {np.percentile(moved[chosen], 99) * 1e3:.2f} mm; at most {max(r.n_awake for r in reports)} awake, "
+        f"in the end {reports[-1].n_awake}"
+    )
+
+
 def bench_quality(pile: PileState) -> None:
     """At rest with all awake: speed, penetration, creep."""
     engine = make_engine(pile, reduction="none")
@@ -145,7 +136,7 @@ def bench_quality(pile: PileState) -> None:
 Rates = Callable[[float], tuple[float, float, float]]
 
 
-class _Motors(LeafSystem):
+class Motors(LeafSystem):
     def __init__(self, machine_rates: Callable[[float], np.ndarray], size: int) -> None:
         super().__init__()
         self._rates = machine_rates
@@ -161,7 +152,7 @@ class _Motors(LeafSystem):
 
 def make_dig(depth: float) -> Rates:
     """Rates (wheels, boom, bucket) of a dig that drives `depth` [m] into the pile's toe, 12 s in all."""
-    drive = (1.0 + depth) / 1.2
+    drive = (1.2 + depth) / 1.2
 
     def rates(t: float) -> tuple[float, float, float]:
         if t < drive:
@@ -192,8 +183,9 @@ def build_dig(
     config: NonsmoothConfig,
     time_step: float = TIME_STEP,
     site: SiteConfig = SITE,
+    y: float = 0.0,
 ) -> tuple[Simulator, object, Machine, NonsmoothRocks]:
-    """Return simulator, plant, machine and rocks of a dig, the bucket's tip 1 m before the toe."""
+    """Return simulator, plant, machine and rocks of a dig, the bucket's tip before the first rock."""
     dynamics = DynamicsConfig(rocks="nonsmooth", nonsmooth=config, time_step=time_step)
     builder = DiagramBuilder()
     plant, scene_graph = add_plant(builder, dynamics)
@@ -205,36 +197,44 @@ def build_dig(
         builder, plant, scene_graph, machine, built, SHAPES, ROCKS, dynamics, pile
     )
     size = len(calc_motor_targets(plant, machine, 0.0, 0.0, 0.0))
-    motors = builder.AddSystem(_Motors(lambda t: calc_motor_targets(plant, machine, *rates(t)), size))
+    motors = builder.AddSystem(Motors(lambda t: calc_motor_targets(plant, machine, *rates(t)), size))
     for port in (plant.get_desired_state_input_port(machine.instance), view.GetInputPort("desired_state")):
         builder.Connect(motors.GetOutputPort("desired_state"), port)
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
-    toe = find_toe(pile)
-    set_machine_pose(plant, plant.GetMyMutableContextFromRoot(context), machine, x_tip=toe - 1.0, z_tip=0.02)
+    x_tip = float(pile.p_WRs[:, 0].min()) - 0.7
+    set_machine_pose(plant, plant.GetMyMutableContextFromRoot(context), machine, x_tip=x_tip, y=y, z_tip=0.02)
     simulator.Initialize()
     return simulator, plant, machine, rocks
 
 
 def run_dig(
     pile: PileState, rates: Rates, config: NonsmoothConfig, duration: float = 12.0, time_step: float = TIME_STEP,
-    site: SiteConfig = SITE,
+    site: SiteConfig = SITE, y: float = 0.0,
 ) -> dict[str, float]:  # fmt: skip
     """Run a dig; return what it cost and did."""
     pile = clear_way(pile)
-    simulator, plant, _machine, rocks = build_dig(pile, rates, config, time_step, site)
+    simulator, plant, _machine, rocks = build_dig(pile, rates, config, time_step, site, y)
     root = simulator.get_mutable_context()
     context = rocks.GetMyContextFromRoot(root)
     plant_context = plant.GetMyContextFromRoot(root)
     bucket = plant.GetBodyByName("bucket")
     rocks.get_report(root)  # loads the compiled kernels
     n_steps = round(duration / time_step)
-    forces, summaries, fastest, redone = np.zeros((n_steps, 6)), np.zeros((n_steps, 6)), 0.0, 0
+    tip = plant.GetFrameByName("tip")
+    start = tip.CalcPoseInWorld(plant_context).translation()[0]
+    forces, summaries, reach = (
+        np.zeros((n_steps, 6)),
+        np.zeros((n_steps, len(ROCK_SUMMARY))),
+        np.zeros(n_steps),
+    )
+    fastest = 0.0
     cpu = time.process_time()
     for k in range(n_steps):
         simulator.AdvanceTo((k + 1) * time_step)
         forces[k] = rocks.GetOutputPort("F_B_W").Eval(context)
         summaries[k] = rocks.GetOutputPort("rock_summary").Eval(context)
+        reach[k] = tip.CalcPoseInWorld(plant_context).translation()[0] - start
         if k % 10 == 0:
             fastest = max(fastest, float(np.abs(rocks.get_pile(root).V_WRs[:, 3:]).max()))
     cpu = time.process_time() - cpu
@@ -247,13 +247,17 @@ def run_dig(
     )  # fmt: skip
     moved = np.linalg.norm(after.p_WRs - pile.p_WRs, axis=1)
     masses = rocks.engine.mass
-    push = -forces[:, 3] * (np.arange(n_steps) * time_step < duration - 4.0)
+    push = -forces[:, 3]
+    # Forces of single steps are noise: the mean over 0.1 s counts.
+    window = round(0.1 / time_step)
+    smooth = np.convolve(push, np.ones(window) / window, mode="valid")
     return {
         "cpu_s": cpu,
         "bucket_mass_kg": float(masses[inside].sum()),
-        "peak_push_kN": float(push.max()) / 1e3,
-        "mean_push_kN": float(push[push > 1e3].mean()) / 1e3 if (push > 1e3).any() else 0.0,
+        "peak_push_kN": float(smooth.max()) / 1e3,
+        "mean_push_kN": float(push[: round(6.0 / time_step)].clip(0.0).mean()) / 1e3,
         "displaced_m3": float((masses * (moved > 0.05)).sum() / ROCKS.density),
+        "reach_m": float(reach.max()),
         "n_moved_5cm": float((moved > 0.05).sum()),
         "awake_mean": float(summaries[:, 0].mean()),
         "awake_max": float(summaries[:, 0].max()),
@@ -262,7 +266,7 @@ def run_dig(
         "residual_max": float(summaries[:, 4].max()),
         "fastest_m_s": fastest,
         "lost": float(summaries[-1, 5]),
-        "redone": float(redone),
+        "flagged": float(summaries[-1, 6]),
     }
 
 
@@ -273,25 +277,31 @@ def bench_dig(pile: PileState, depth: float, reduction: str) -> None:
 
 
 def bench_scaling(pile: PileState) -> None:
-    """The same shallow dig with the pile's void four times as full of rocks behind it."""
-    site = SiteConfig(drift_width=6.5, void_depth=7.2 + 3 * 9.0)
-    copies = [pile]
-    deep = pile.p_WRs[:, 0] > 0.6
-    block = pile.select(deep)
-    for k in range(1, 6):
-        copies.append(replace(block, p_WRs=block.p_WRs + [5.0 * k + 2.0 * (k > 0), 0, 0]))
-    total = copies[0]
-    for item in copies[1:]:
-        total = total.join(item)
-    for name, rocks, where in (("one", pile, SITE), ("many", total, site)):
+    """The same shallow dig with four more blocks of the same pile behind it, about 22 000 rocks."""
+    block = pile.select(pile.p_WRs[:, 0] > 0.6)
+    width = SITE.void_depth - 0.5
+    n_blocks = 4
+    total = pile
+    for k in range(1, n_blocks + 1):
+        total = total.join(replace(block, p_WRs=block.p_WRs + [k * width, 0.0, 0.0]))
+    site = SITE.model_copy(update={"void_depth": SITE.void_depth + n_blocks * width})
+    # They lean on each other now instead of on a wall.
+    engine = make_engine(total, site)
+    arrays = engine.make_arrays(total)
+    for _ in range(300):
+        arrays, report = engine.advance(arrays)
+    print(f"scaling: {len(total)} rocks, {report.n_awake} awake after 3 s without a machine")
+    total = engine.make_pile(arrays)
+    for rocks, where in ((pile, SITE), (total, site)):
         result = run_dig(rocks, make_dig(1.0), NonsmoothConfig(), site=where)
-        print(f"scaling: {name}, {len(rocks)} rocks: " + ", ".join(f"{k} {v:.4g}" for k, v in result.items()))
+        print(f"scaling: {len(rocks)} rocks: " + ", ".join(f"{k} {v:.4g}" for k, v in result.items()))
 
 
 CASES: dict[str, Callable[[PileState], None]] = {
     "awake": bench_awake,
     "resting": bench_resting,
     "quality": bench_quality,
+    "woken": bench_woken,
     "shallow": lambda pile: bench_dig(pile, 1.0, "rest"),
     "deep": lambda pile: bench_dig(pile, 3.5, "rest"),
     "shallow-none": lambda pile: bench_dig(pile, 1.0, "none"),

@@ -77,8 +77,15 @@ def small_scenario() -> Scenario:
     return Scenario.model_validate(
         {
             "seed": 5,
-            "site": {"drift_width": 3.9, "void_depth": 0.6},
-            "pile": {"rocks": 60, "emission_reach": 1.2, "settle_speed": 0.2},
+            "site": {"drift_width": 3.9, "void_depth": 0.6, "rear_layer": 0.0},
+            "pile": {
+                "rocks": 60,
+                "emission_height": 2.0,
+                "emission_reach": 1.2,
+                "emission_interval": 0.25,
+                "settle_speed": 0.2,
+            },
+            "dynamics": {"rocks": "plant"},
             "loading": {"strategy": {"alpha": 0.3, "beta": 0.4, "gamma": 1.0, "kappa": 0.5}},
         }
     )

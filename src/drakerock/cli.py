@@ -80,7 +80,16 @@ def pile(
     if json_:
         print(json.dumps(summary))
         return
+    gradation = Table(title="Gradation", title_justify="left")
+    for name in ("sieve width", "rocks", "mass", "share", "wanted"):
+        gradation.add_column(name, justify="right")
+    for item in summary.pop("gradation"):
+        gradation.add_row(
+            f"{item['size_m']:g} m", f"{item['rocks']}", f"{item['mass_kg'] / 1e3:.1f} t",
+            f"{100 * item['share']:.1f} +- {100 * item['standard_error']:.1f} %", f"{100 * item['wanted']:.0f} %",
+        )  # fmt: skip
     _print_table("Pile", summary)
+    output.print(gradation)
     _print_paths(paths)
 
 
@@ -92,20 +101,41 @@ def load(
     beta: Annotated[float | None, typer.Option(help="Dig height, 0 deep to 1 shallow.")] = None,
     gamma: Annotated[float | None, typer.Option(help="Entry point, 1 front-most, 0 rear-most.")] = None,
     kappa: Annotated[float | None, typer.Option(help="Share of the curl done while lifting, 0 to 1.")] = None,
+    plan: Annotated[
+        Path | None, typer.Option(help="A stored plan.json to execute instead of planning.")
+    ] = None,
+    loadings: Annotated[
+        int | None, typer.Option(min=1, help="Run or resume a sequence of so many loadings.")
+    ] = None,
+    figures: Annotated[bool, typer.Option("--figures", help="Write the pictures, too, as PNG.")] = False,
     seed: SeedOption = None,
     set_: SetOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Run one loading cycle and write its outcome, signals, piles and replay.
+    """Run one loading cycle, or a sequence, and write outcome, signals, piles and replay.
 
     Example: drakerock load studies/demo.yaml --alpha 1.3 --beta 0.85 --out out/load
     """
-    from drakerock.study.jobs import run_and_save
+    from drakerock.study.jobs import run_and_save, run_and_save_sequence
 
     strategy = {"alpha": alpha, "beta": beta, "gamma": gamma, "kappa": kappa}
     overrides = [f"loading.strategy.{key}={value}" for key, value in strategy.items() if value is not None]
+    if plan is not None:
+        overrides.append(f"loading.planning.source={json.dumps(str(plan))}")
+    config = _load(scenario, seed, [*(set_ or []), *overrides])
+    if loadings is not None:
+        with _show_progress("load") as advance:
+            summary, paths = run_and_save_sequence(config, loadings, out, advance, figures=figures)
+        if json_:
+            print(json.dumps(summary))
+        else:
+            _print_sequence(summary)
+            _print_paths(paths)
+        if summary["failed"]:
+            raise SimulationFailure(summary["reasons"][-1])
+        return
     with _show_progress("load") as advance:
-        result, paths = run_and_save(_load(scenario, seed, [*(set_ or []), *overrides]), out, advance)
+        result, paths = run_and_save(config, out, advance, figures=figures)
     if json_:
         print(result.to_json(), end="")
     else:
@@ -330,6 +360,32 @@ def _print_outcome(outcome: Any) -> None:
         "cost",
         f"{outcome.wall_time_s:.1f} s for {outcome.sim_time_s:.1f} s, {outcome.ms_per_step:.1f} ms per step",
     )
+    output.print(table)
+
+
+def _print_sequence(summary: dict[str, Any]) -> None:
+    strategy = "  ".join(f"{key} {value:g}" for key, value in summary["strategy"].items())
+    title = f"{summary['loadings']} loadings, {strategy}"
+    table = Table(title=title, title_justify="left")
+    rows = {
+        "production": ("production [kg/s]", "{:.0f}"),
+        "damage": ("damage", "{:.4f}"),
+        "debris": ("debris [kg]", "{:.0f}"),
+        "bucket_mass_kg": ("bucket load [kg]", "{:.0f}"),
+        "loading_time_s": ("loading time [s]", "{:.2f}"),
+        "energy_J": ("motors' work [J]", "{:.3g}"),
+        "wall_time_s": ("wall time of a cycle [s]", "{:.1f}"),
+    }
+    table.add_column("")
+    for heading in ("mean", "standard error", "spread", "values"):
+        table.add_column(heading, justify="right")
+    for name, (label, form) in rows.items():
+        row = summary["quantities"][name]
+        numbers = [
+            "-" if row[key] is None else form.format(row[key]) for key in ("mean", "standard_error", "spread")
+        ]
+        values = "  ".join("-" if value is None else form.format(value) for value in row["values"])
+        table.add_row(label, *numbers, values)
     output.print(table)
 
 

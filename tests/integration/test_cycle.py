@@ -7,6 +7,7 @@ from pydrake.systems.analysis import InitializeParams, Simulator
 from drakerock.loading.control import Mode
 from drakerock.loading.cycle import run_cycle
 from drakerock.loading.recording import load_recording, save_recording
+from drakerock.loading.signals import calc_signals
 from drakerock.loading.station import make_station
 from drakerock.machine.placement import set_machine_pose
 from drakerock.study.jobs import get_pile
@@ -37,6 +38,50 @@ def test_bucket_forces_lift_the_load(result):
         pytest.skip("nothing in the bucket")
     force = -np.mean(result.signals["bucket_force_z"][standing]) / 9.81
     assert force == pytest.approx(result.outcome.bucket_mass_kg, abs=150)
+
+
+def test_load_is_counted_when_s4_is_passed(small_scenario, pile, result):
+    """The simulation stops in the step in which the controller passes s4, not at the next frame."""
+    config = small_scenario.model_copy(
+        update={"recording": small_scenario.recording.model_copy(update={"frame_rate": 2.0})}
+    )
+    coarse = run_cycle(config, pile).outcome
+    assert coarse.bucket_mass_kg == result.outcome.bucket_mass_kg
+    assert coarse.waypoint_times_s == result.outcome.waypoint_times_s
+
+
+@pytest.mark.parametrize("engine", ["plant", "nonsmooth"])
+def test_rows_hold_the_step_that_begins(small_scenario, pile, engine):
+    dynamics = small_scenario.dynamics.model_copy(update={"rocks": engine})
+    station = make_station(small_scenario.model_copy(update={"dynamics": dynamics}), pile)
+    simulator = Simulator(station.diagram)
+    root = simulator.get_mutable_context()
+    station.rocks.set_pile(root, pile)
+    context = station.plant.GetMyMutableContextFromRoot(root)
+    set_machine_pose(station.plant, context, station.machine, x_tip=-1.5, z_tip=0.03)
+    simulator.AdvanceTo(0.3)
+    # What the coming step will do, asked for before it is taken.
+    if engine == "nonsmooth":
+        report = station.rocks.get_report(root)
+        contacts, forces = report.n_contacts, report.F_Bs_W
+    else:
+        contacts = station.plant.get_contact_results_output_port().Eval(context).num_point_pair_contacts()
+        forces = np.array(
+            [station.rocks.GetOutputPort("F_B_W").Eval(station.rocks.GetMyContextFromRoot(root))]
+        )
+    moment = station.plant.get_reaction_forces_output_port().Eval(context)
+    joint = station.plant.GetJointByName("bucket_joint", station.machine.instance)
+    simulator.AdvanceTo(0.35)
+    signals, _ = calc_signals(station, root)
+    row = 30
+    assert signals["time"][row] == pytest.approx(0.3)
+    force = [signals[f"bucket_{k}_{axis}"][row] for k in ("torque", "force") for axis in "xyz"]
+    assert np.abs(force).max() > 10.0
+    assert np.min(np.abs(forces - force).max(axis=1)) < 1e-6
+    if engine == "nonsmooth":
+        assert signals["n_contacts"][row] == contacts
+    hinge = moment[int(joint.index())].rotational()
+    assert signals["hinge_moment"][row] == pytest.approx(np.hypot(hinge[0], hinge[2]))
 
 
 def test_recording_round_trip(result, tmp_path):

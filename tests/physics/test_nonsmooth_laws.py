@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from drakerock.dynamics.config import NonsmoothConfig
@@ -58,7 +61,11 @@ def make_still_machine(pose, n_bodies=1):
         np.zeros(1),
         np.zeros(1),
         MachineArrays(
-            np.zeros((n_bodies, 6, 1)), np.zeros((n_bodies, 1, 6)), np.zeros((n_bodies, 6, 6)), np.zeros((0, 1)), np.zeros((0, 1)),
+            np.zeros((n_bodies, 6, 1)),
+            np.zeros((n_bodies, 1, 6)),
+            np.zeros((n_bodies, 6, 6)),
+            np.zeros((0, 1)),
+            np.zeros((0, 1)),
             np.zeros((0, MACHINE_ROW_WIDTH)),
         ),
         np.zeros((0, 18)),
@@ -146,9 +153,7 @@ def test_arch_of_blocks_stands_and_thrusts():
     n, inner, outer, width = 9, 2.0, 3.0, 1.0
     angles = np.linspace(0, np.pi, n + 1)
     meshes, centres = [], []
-    import trimesh
-
-    for a0, a1 in zip(angles[:-1], angles[1:], strict=True):
+    for a0, a1 in itertools.pairwise(angles):
         points = [
             [r * np.cos(a), y, r * np.sin(a)] for r in (inner, outer) for a in (a0, a1) for y in (0, width)
         ]

@@ -100,7 +100,7 @@ class DynamicsConfig(Config):
     """Time stepping and contact of the whole Diagram."""
 
     rocks: Annotated[Literal["plant", "nonsmooth"], Field(description="the engine that moves the rocks")] = (
-        "plant"
+        "nonsmooth"
     )
     time_step: Annotated[float, Field(gt=1e-4, le=0.05, description="[s]")] = 0.01
     contact_approximation: Annotated[

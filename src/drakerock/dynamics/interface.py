@@ -15,10 +15,12 @@ ROCK_SUMMARY: dict[str, str] = {
     "penetration_p99": "m",
     "residual": "1",
     "n_lost": "1",
+    "n_flagged": "1",
 }
 """Elements of the ``rock_summary`` output, with units: rocks that are simulated, their contacts, the deepest and the
 99th percentile of the penetration, the solver's residual relative to the sum of impulses (0 where the solver
-converges to its own tolerance), rocks that have left the site."""
+converges to its own tolerance), rocks that have left the site, steps so far
+whose residual or penetration was beyond its bound (0 where the engine has none)."""
 
 
 class RockSystem(Protocol):

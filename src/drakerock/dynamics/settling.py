@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 from platformdirs import user_cache_path
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from scipy.spatial.transform import Rotation
 
 import drakerock
 from drakerock.config import Config, calc_config_hash
@@ -22,14 +22,29 @@ from drakerock.dynamics.nonsmooth.engine import NonsmoothEngine
 from drakerock.dynamics.plant.rocks import add_plant_rocks, add_rock_bodies
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.pile.config import PileConfig, RocksConfig, SiteConfig
-from drakerock.pile.emission import place_rocks, sample_rocks
+from drakerock.pile.emission import (
+    Emitter,
+    calc_level,
+    calc_mean_volume,
+    make_emitter,
+    make_rear_emitter,
+    place_rocks,
+    sample_rocks,
+)
 from drakerock.pile.shapes import RockShape, load_rock_shapes
-from drakerock.pile.site import make_site
+from drakerock.pile.site import Site, make_confined_site, make_site
 from drakerock.pile.state import PileState, load_pile, make_empty_pile, save_pile
 from drakerock.randomness import make_generator
+from drakerock.resources import find_data
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and its share done in [0, 1]."""
+
+
+# The void is full when its level has stayed at the emitter for so many batches: rocks still flow out.
+FULL_BATCHES = 4
+# So many batches without room for a single rock: it will never find any.
+MISSED_BATCHES = 20
 
 
 class PileRecipe(Config):
@@ -48,6 +63,7 @@ def settle(
     recipe: PileRecipe,
     duration: float,
     *,
+    site: Site | None = None,
     until_rest: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[PileState, bool]:
@@ -58,8 +74,9 @@ def settle(
         shapes: the rock shapes.
         recipe: site, rocks, rest criterion, dynamics.
         duration: longest simulated time [s].
-        until_rest: stop as soon as 99 % of the rocks moved less than settle_speed * settle_window over the
-            last settle_window.
+        site: the surroundings, if not the recipe's.
+        until_rest: stop as soon as 99 % of the moving rocks moved less than settle_speed * settle_window over
+            the last settle_window.
         progress: called with the share of the duration done.
 
     Returns:
@@ -69,7 +86,7 @@ def settle(
         SimulationFailure: the dynamics failed.
     """
     advance = _make_plant_advance if recipe.dynamics.rocks == "plant" else _make_nonsmooth_advance
-    advance_to = advance(pile, shapes, recipe)
+    advance_to = advance(pile, shapes, recipe, site or make_site(recipe.site))
     window, resting, time = recipe.pile.settle_window, False, 0.0
     before = pile
     while time < duration - 1e-9 and not (until_rest and resting):
@@ -78,20 +95,37 @@ def settle(
             after = advance_to(time)
         except RuntimeError as error:
             raise SimulationFailure(f"settling the pile failed at {time:.2f} s: {error}") from None
-        moved = np.linalg.norm(after.p_WRs - before.p_WRs, axis=1)
-        resting = bool(np.percentile(moved, 99) < recipe.pile.settle_speed * window)
+        moved = np.linalg.norm(after.p_WRs - before.p_WRs, axis=1)[~pile.fixed]
+        resting = bool(len(moved) == 0 or np.percentile(moved, 99) < recipe.pile.settle_speed * window)
         before = after
         if progress:
             progress(time / duration)
     return before, resting
 
 
+def calc_creep(
+    pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe, duration: float
+) -> NDArray[np.float64]:
+    """Return how far each moving rock (m,) moves within `duration` [s] when all are woken [m]: rest, checked.
+
+    Raises:
+        SimulationFailure: the dynamics failed.
+    """
+    woken = pile
+    if pile.contacts is not None:
+        contacts = replace(pile.contacts, resting=np.zeros(len(pile), np.bool_))
+        woken = replace(pile, contacts=contacts)
+    after, _ = settle(woken, shapes, recipe, duration)
+    moved: NDArray[np.float64] = np.linalg.norm(after.p_WRs - pile.p_WRs, axis=1)[~pile.fixed]
+    return moved
+
+
 def _make_plant_advance(
-    pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe
+    pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe, site: Site
 ) -> Callable[[float], PileState]:
     builder = DiagramBuilder()
     plant, _ = add_plant(builder, recipe.dynamics)
-    add_site(plant, make_site(recipe.site), recipe.dynamics)
+    add_site(plant, site, recipe.dynamics)
     geometries = add_rock_bodies(plant, pile, shapes, recipe.rocks, recipe.dynamics)
     plant.Finalize()
     rocks = add_plant_rocks(builder, plant, pile, geometries)
@@ -107,10 +141,10 @@ def _make_plant_advance(
 
 
 def _make_nonsmooth_advance(
-    pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe
+    pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe, site: Site
 ) -> Callable[[float], PileState]:
     engine = NonsmoothEngine(
-        recipe.rocks, shapes, make_site(recipe.site), recipe.dynamics.nonsmooth, recipe.dynamics.time_step,
+        recipe.rocks, shapes, site, recipe.dynamics.nonsmooth, recipe.dynamics.time_step,
         pile.shape, pile.size, pile.fixed,
     )  # fmt: skip
     arrays = engine.make_arrays(pile)
@@ -127,26 +161,49 @@ def _make_nonsmooth_advance(
 
 
 def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState:
-    """Make a pile: rocks emitted in batches from above, each falling on what is there, then all to rest.
+    """Make a pile: the static rocks of the rear wall, then rocks emitted from above, then all to rest.
 
-    Same recipe, same pile, bit for bit.
+    With `pile.rocks` null, rocks are emitted until the void is full to the emitter. Same recipe, same pile, bit
+    for bit.
 
     Raises:
-        InputError: the rocks do not fit under the emission height.
+        InputError: a rock finds no room in the emitter.
         SimulationFailure: the dynamics failed, or the pile did not come to rest in time.
     """
     shapes = load_rock_shapes(recipe.rocks.shapes)
     rng = make_generator(recipe.seed, "pile")
-    waiting = sample_rocks(recipe.pile.rocks, recipe.rocks, shapes, rng)
-    pile = drop_rocks(waiting, make_empty_pile(), shapes, recipe, rng, progress)
+    site, n = recipe.site, recipe.pile.rocks
+    pile = make_empty_pile()
+    if site.rear_layer:
+        waiting = sample_rocks(_count_filling(recipe, site.rear_layer), recipe.rocks, shapes, rng)
+        emitter = make_rear_emitter(site, recipe.pile)
+        mould = make_confined_site(site)
+        layer = drop_rocks(
+            waiting, pile, shapes, recipe, emitter, rng, until_full=True, site=mould, stage="rear wall",
+            progress=progress,
+        )  # fmt: skip
+        # What holds the static rocks is no longer the contacts they settled with.
+        pile = replace(layer, fixed=np.ones(len(layer), bool), contacts=None)
+    number = n or _count_filling(recipe, site.void_depth + 1.5 * site.drift_height)
+    waiting = sample_rocks(number, recipe.rocks, shapes, rng)
+    emitter = make_emitter(site, recipe.pile)
+    pile = drop_rocks(waiting, pile, shapes, recipe, emitter, rng, until_full=n is None, progress=progress)
     # The pile starts as a sequence leaves it after each loading: without loose rocks on the floor.
-    pile = pile.select(~find_loose(pile, shapes, recipe.pile.contact_gap))
+    pile = pile.select(pile.fixed | ~find_loose(pile, shapes, recipe.pile.contact_gap))
     provenance = {
-        "made_by": f"drakerock {drakerock.__version__}",
         "recipe": calc_config_hash(recipe),
         "seed": recipe.seed,
+        "versions": {"drakerock": drakerock.__version__}
+        | {name: version(name) for name in ("drake", "numba", "numpy")},
     }
     return replace(pile, provenance=provenance)
+
+
+def _count_filling(recipe: PileRecipe, depth: float) -> int:
+    """Return more rocks than fit under the emitter over a depth [m]: as if they filled it without gaps."""
+    shapes = load_rock_shapes(recipe.rocks.shapes)
+    room = depth * recipe.site.drift_width * (recipe.pile.emission_height + 1.0)
+    return int(np.ceil(room / calc_mean_volume(recipe.rocks, shapes)))
 
 
 def drop_rocks(
@@ -154,51 +211,79 @@ def drop_rocks(
     pile: PileState,
     shapes: tuple[RockShape, ...],
     recipe: PileRecipe,
+    emitter: Emitter,
     rng: np.random.Generator,
+    *,
+    until_full: bool = False,
+    site: Site | None = None,
+    stage: str = "dropping rocks",
     progress: Progress | None = None,
 ) -> PileState:
     """Emit rocks in batches from above onto a pile, and let all come to rest.
 
     Args:
-        waiting: the rocks to emit, in this order; their turns are kept, their positions drawn.
+        waiting: the rocks to emit, in this order, at drawn turns and places.
         pile: what is there already.
         shapes: the rock shapes.
-        recipe: site, emission box, rest criterion, dynamics.
-        rng: source of the positions.
+        recipe: site, rest criterion, dynamics.
+        emitter: where rocks appear.
+        rng: source of the turns and places.
+        until_full: emit only while the pile's level is below the emitter, and stop when it stays there, whatever
+            still waits.
+        site: the surroundings, if not the recipe's.
+        stage: what to call it in the progress.
         progress: called as things proceed.
 
     Returns:
         The pile at rest, the emitted rocks last, in the order in which they found room.
 
     Raises:
-        InputError: the rocks do not fit under the emission height.
+        InputError: a rock finds no room in the emitter.
         SimulationFailure: the dynamics failed, or the pile did not come to rest in time.
     """
-    total = len(pile) + len(waiting)
-    half = 0.5 * recipe.site.drift_width
-    low = np.array([-recipe.pile.emission_reach, -half, 0.0])
-    high = np.array([recipe.site.void_depth, half, recipe.pile.emission_height])
-    while len(waiting):
-        if progress:
-            progress("dropping rocks", 0.8 * len(pile) / total)
-        placed, waiting = place_rocks(waiting, pile, shapes, low, high, rng)
-        if len(placed) == 0:
+    total, missed, full = len(waiting), 0, 0
+    while len(waiting) and full < FULL_BATCHES:
+        level = calc_level(pile, emitter)
+        full = full + 1 if until_full and level >= emitter.low[2] else 0
+        if not full:
+            placed, waiting = place_rocks(waiting, pile, shapes, emitter, rng)
+            missed = 0 if len(placed) else missed + 1
+            pile = pile.join(placed)
+        if missed > MISSED_BATCHES and not until_full:
             raise InputError(
-                f"pile.rocks: only {len(pile)} of {total} rocks fit below pile.emission_height = "
-                f"{recipe.pile.emission_height:g} m; raise it, widen the site, or ask for fewer rocks"
+                f"pile.rocks: only {total - len(waiting)} of {total} rocks find room in the emitter, "
+                f"{np.round(emitter.high - emitter.low, 2).tolist()} m; raise pile.emission_height, "
+                "pile.emission_reach or pile.emission_interval, widen the site, or ask for fewer rocks"
             )
-        pile, _ = settle(pile.join(placed), shapes, recipe, recipe.pile.batch_time)
+        pile, _ = settle(pile, shapes, recipe, emitter.interval, site=site)
+        if progress:
+            share = level / emitter.low[2] if until_full else 1.0 - len(waiting) / total
+            progress(stage, 0.8 * min(share, 1.0))
     pile, resting = settle(
-        pile,
-        shapes,
-        recipe,
-        recipe.pile.max_time,
-        until_rest=True,
+        pile, shapes, recipe, recipe.pile.max_time, site=site, until_rest=True,
         progress=(lambda share: progress("settling", 0.8 + 0.2 * share)) if progress else None,
-    )
+    )  # fmt: skip
     if not resting:
         raise SimulationFailure(f"the pile did not come to rest within {recipe.pile.max_time:g} s")
+    if pile.contacts is not None:
+        pile = _balance(pile, shapes, recipe, site)
     return replace(pile, V_WRs=np.zeros_like(pile.V_WRs))
+
+
+def _balance(
+    pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe, site: Site | None
+) -> PileState:
+    """Return a settled pile with its contact forces in balance with the weights, all rocks resting.
+
+    Rocks come to rest one after the other, each with the forces of that moment, which later rest changes. So all
+    are kept awake for a while at the end.
+    """
+    nonsmooth = recipe.dynamics.nonsmooth.model_copy(update={"reduction": "none"})
+    dynamics = recipe.dynamics.model_copy(update={"nonsmooth": nonsmooth})
+    awake = recipe.model_copy(update={"dynamics": dynamics})
+    pile, _ = settle(pile, shapes, awake, recipe.pile.balance_time, site=site)
+    assert pile.contacts is not None
+    return replace(pile, contacts=replace(pile.contacts, resting=~pile.fixed))
 
 
 def refill(
@@ -208,31 +293,34 @@ def refill(
     recipe: PileRecipe,
     rng: np.random.Generator,
 ) -> PileState:
-    """Return the pile with the removed rocks emitted anew from above, so that its level is restored, at rest.
+    """Return the pile without the removed rocks, new ones emitted from above until its level is restored, at rest.
 
-    The new rocks have the removed ones' shapes and sizes, so that the gradation stays over a long sequence, and
-    new turns and places.
+    The new rocks have the removed ones' shapes and sizes, so that the gradation stays over a long sequence. With
+    `pile.rocks` set, all are emitted and their number stays too. With null, the void is filled to the emitter again:
+    none is emitted while the void's level has not sunk, and further ones are drawn when the pile has slid.
 
     Args:
         pile: all rocks, the removed ones among them.
         removed: (n,) rocks taken away, in the bucket or as debris.
         shapes: the rock shapes.
         recipe: as in `drop_rocks`.
-        rng: source of the turns and places.
+        rng: source of the further rocks, the turns and places.
 
     Raises:
         SimulationFailure, InputError: as `drop_rocks`.
     """
-    waiting = pile.select(removed)
-    turns = (
-        Rotation.random(len(waiting), rng=rng).as_quat(scalar_first=True) if len(waiting) else waiting.q_WRs
-    )
-    waiting = replace(waiting, q_WRs=turns, V_WRs=np.zeros((len(waiting), 6)))
-    return drop_rocks(waiting, pile.select(~removed), shapes, recipe, rng)
+    waiting, until_full = replace(pile.select(removed), contacts=None), recipe.pile.rocks is None
+    if until_full:
+        number = _count_filling(recipe, recipe.site.void_depth)
+        waiting = waiting.join(sample_rocks(number, recipe.rocks, shapes, rng))
+    emitter = make_emitter(recipe.site, recipe.pile)
+    return drop_rocks(waiting, pile.select(~removed), shapes, recipe, emitter, rng, until_full=until_full)
 
 
 def fetch_pile(recipe: PileRecipe, progress: Progress | None = None) -> tuple[PileState, Path]:
-    """Return the recipe's pile and its file: the one `pile.source` names, or from the cache, or made now.
+    """Return the recipe's pile and its file: the one `pile.source` names, the shipped one, from the cache, or made.
+
+    The shipped pile (``piles/default.npz``) is that of the default recipe; any other has to be made once.
 
     Raises:
         InputError: an unreadable pile file. Otherwise as `make_pile`.
@@ -240,6 +328,10 @@ def fetch_pile(recipe: PileRecipe, progress: Progress | None = None) -> tuple[Pi
     if recipe.pile.source is not None:
         path = Path(recipe.pile.source)
         return check_pile(load_pile(path), recipe, path), path
+    shipped = find_data("piles", "default.npz")
+    pile = load_pile(shipped)
+    if pile.provenance.get("recipe") == calc_config_hash(recipe):
+        return pile, shipped
     path = user_cache_path("drakerock") / "piles" / f"{calc_config_hash(recipe, drakerock.__version__)}.npz"
     if path.exists():
         try:
@@ -261,7 +353,7 @@ def check_pile(pile: PileState, recipe: PileRecipe, path: Path) -> PileState:
     """Return the pile if it fits the scenario's shapes and site.
 
     Raises:
-        InputError: a shape index that the scenario does not have, or rocks outside the site.
+        InputError: no rocks, a shape or size that the scenario does not have, or rocks outside the site.
     """
     if len(pile) == 0:
         raise InputError(f"{path}: the pile holds no rocks")
@@ -270,10 +362,20 @@ def check_pile(pile: PileState, recipe: PileRecipe, path: Path) -> PileState:
             f"{path}: rock shape {pile.shape.max()} is not among the scenario's {len(recipe.rocks.shapes)} "
             "(rocks.shapes)"
         )
-    outside = int(np.sum(np.abs(pile.p_WRs[:, 1]) > 0.5 * recipe.site.drift_width))
-    if outside > 0.01 * len(pile):
+    known = np.array([item.size_m for item in recipe.rocks.gradation])
+    unknown = ~np.isclose(pile.size[:, None], known).any(axis=1)
+    if unknown.any():
         raise InputError(
-            f"{path}: {outside} of {len(pile)} rocks lie outside the drift "
-            f"(site.drift_width = {recipe.site.drift_width:g} m)"
+            f"{path}: rocks of {pile.size[unknown][0]:g} m are not in the scenario's gradation "
+            f"({', '.join(f'{size:g}' for size in known)} m)"
         )
+    site = recipe.site
+    for axis, low, high, key in (
+        (0, -site.drift_length, site.void_depth, f"site.void_depth = {site.void_depth:g} m"),
+        (1, -0.5 * site.drift_width, 0.5 * site.drift_width, f"site.drift_width = {site.drift_width:g} m"),
+        (2, 0.0, np.inf, "the floor"),
+    ):
+        outside = int(np.sum((pile.p_WRs[:, axis] < low) | (pile.p_WRs[:, axis] > high)))
+        if outside:
+            raise InputError(f"{path}: {outside} of {len(pile)} rocks lie outside the site ({key})")
     return pile

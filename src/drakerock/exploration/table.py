@@ -169,10 +169,8 @@ class ResponseTable:
         """
         path = _find_table(Path(path))
         try:
-            if path.suffix == ".parquet":
-                arrow = pyarrow.parquet.read_table(path)
-            else:
-                arrow = pyarrow.csv.read_csv(path)
+            read = pyarrow.parquet.read_table if path.suffix == ".parquet" else pyarrow.csv.read_csv
+            arrow = read(path)
         except (pa.ArrowException, OSError) as error:
             raise InputError(f"{path}: cannot be read as a table: {error}") from None
         provenance = _read_provenance(path.parent / "study.json")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -21,9 +21,31 @@ class StrategyConfig(Config):
     kappa: Annotated[Share, Field(description="share of the curl done between s1 and s2")] = 0.5
 
 
+class ScannerConfig(Config):
+    """A scanner on the front unit: where it sits, what it sees, how well."""
+
+    position: Annotated[
+        tuple[float, float, float], Field(description="in the front unit's frame F: x, y, z [m]")
+    ] = (0.3, 0.0, 2.0)
+    pitch_deg: Annotated[
+        float, Field(ge=-90, le=90, description="of its axis, downwards from F's x [deg]")
+    ] = 5.0
+    horizontal_field_deg: Annotated[float, Field(gt=0, le=360, description="[deg]")] = 120.0
+    vertical_field_deg: Annotated[float, Field(gt=0, le=180, description="[deg]")] = 60.0
+    resolution_deg: Annotated[float, Field(gt=0, le=10, description="angle between rays [deg]")] = 0.4
+    range: Annotated[float, Field(gt=0, le=500, description="nothing farther is seen [m]")] = 40.0
+    range_noise: Annotated[float, Field(ge=0, le=1, description="standard deviation [m]")] = 0.02
+    dropout: Annotated[float, Field(ge=0, le=1, description="share of the rays that return nothing")] = 0.02
+    distance: Annotated[float, Field(gt=0, le=100, description="bucket tip to brow when it scans [m]")] = 10.0
+
+
 class SensingConfig(Config):
     """The height field and what is read from it."""
 
+    kind: Annotated[
+        Literal["ideal", "scanner"], Field(description="true surface seen from above, or the machine's scan")
+    ] = "ideal"
+    scanner: ScannerConfig = ScannerConfig()
     cell: Annotated[float, Field(gt=0.02, le=2, description="grid spacing [m]")] = 0.26
     front_height: Annotated[float, Field(gt=0, le=2, description="the front is where h exceeds this [m]")] = (
         0.15
@@ -33,6 +55,9 @@ class SensingConfig(Config):
 class PlanningConfig(Config):
     """The dig plan's limits and speeds."""
 
+    source: Annotated[str | None, Field(description="a stored plan.json to execute instead of planning")] = (
+        None
+    )
     v_x_max: Annotated[float, Field(gt=0, le=5, description="forward and reverse speed [m/s]")] = 1.3
     r_ft: Annotated[float, Field(gt=0, le=20, description="reach that scales the dig height, h_p [m]")] = 4.24
     tilt_rate: Annotated[float, Field(gt=0, le=3, description="bucket's rate on [s2, s3] [rad/s]")] = 0.5
@@ -58,6 +83,7 @@ class ControlConfig(Config):
         float, Field(gt=0, le=1, description="lowest speed before a waypoint, share of its segment's maximum")
     ] = 0.1
     timeout: Annotated[float, Field(gt=0, description="allowed beyond a segment's planned time [s]")] = 5.0
+    approach_time: Annotated[float, Field(gt=0, description="allowed from the start to s0 [s]")] = 20.0
 
 
 class PerformanceConfig(Config):
@@ -67,8 +93,14 @@ class PerformanceConfig(Config):
     t_char: Annotated[float, Field(gt=0, description="characteristic time of the damage integral [s]")] = 12.0
     settle_time: Annotated[
         float, Field(ge=0, le=60, description="at most this long after s4 for the rocks to rest [s]")
-    ] = 4.0
-    rest_speed: Annotated[float, Field(gt=0, description="rocks slower than this rest [m/s]")] = 0.1
+    ] = 6.0
+    rest_speed: Annotated[
+        float, Field(gt=0, description="rocks rest when all are slower than this, on average ... [m/s]")
+    ] = 0.05
+    rest_window: Annotated[float, Field(gt=0, le=10, description="... over this time [s]")] = 0.5
+    weighing_delay: Annotated[
+        float, Field(ge=0, le=10, description="after s4, until the braked machine's weight is read [s]")
+    ] = 0.5
     stall_speed: Annotated[
         float, Field(gt=0, description="stall: slower than this while told to drive on [m/s]")
     ] = 0.05

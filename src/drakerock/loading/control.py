@@ -10,8 +10,8 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drakerock.loading.config import ControlConfig
-from drakerock.loading.plan import DigPlan, NoPlan
-from drakerock.machine.kinematics import Kinematics, calc_bucket_range, calc_joint_rates
+from drakerock.loading.plan import DigPlan, NoPlan, calc_motor_rates, clamp_rates
+from drakerock.machine.kinematics import Kinematics, calc_bucket_range
 from drakerock.machine.measurement import MEASUREMENT
 
 Array = NDArray[np.float64]
@@ -69,7 +69,7 @@ def calc_motor_speeds(
         at = project_on_path(plan, 1, x, z)
         v_z = plan.v_z.calc(z) if z < plan.v_z.at[-1] else 0.0
         omega = plan.omega.calc(psi) if psi < plan.omega.at[-1] else 0.0
-        speeds = calc_joint_rates(
+        speeds = calc_motor_rates(
             kinematics, float(plan.phi_l[at]), float(plan.phi_b[at]), plan.v_x.calc(x), v_z, omega
         )
     elif mode == Mode.S2:
@@ -78,8 +78,7 @@ def calc_motor_speeds(
         speeds = np.array([-plan.drive_speed / kinematics.wheel_radius, 0.0, 0.0])
     else:
         speeds = np.zeros(3)
-    limits = np.array([kinematics.wheel_speed, kinematics.boom_speed, kinematics.bucket_speed])
-    return np.clip(speeds, -limits, limits)
+    return clamp_rates(kinematics, speeds)
 
 
 def calc_passed(
@@ -119,12 +118,12 @@ def calc_passed(
     return False
 
 
-def calc_allowed_time(plan: DigPlan, mode: Mode, timeout: float) -> float:
-    """Return how long `mode` may last: its planned time plus the time-out [s]."""
+def calc_allowed_time(plan: DigPlan, mode: Mode, config: ControlConfig) -> float:
+    """Return how long `mode` may last: a segment its planned time plus the time-out [s]."""
     if mode == Mode.APPROACH:
-        return 10.0 * timeout
+        return config.approach_time
     planned = plan.waypoint_t[mode] - plan.waypoint_t[mode - 1]
-    return float(planned) + timeout
+    return float(planned) + config.timeout
 
 
 class FeedforwardController(LeafSystem):
@@ -177,7 +176,7 @@ class FeedforwardController(LeafSystem):
             if mode != Mode.ABORTED:
                 progress[MODE], progress[ENTERED] = Mode.ABORTED, time
         elif mode < Mode.DONE:
-            late = time - progress[ENTERED] > calc_allowed_time(plan, mode, self._config.timeout)
+            late = time - progress[ENTERED] > calc_allowed_time(plan, mode, self._config)
             passed = calc_passed(plan, mode, self._kinematics, *self._read(context))
             if passed or late:
                 progress[TIMEOUTS][mode] = float(not passed)

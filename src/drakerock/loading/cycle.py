@@ -13,17 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.analysis import InitializeParams, Simulator
+from pydrake.systems.framework import Context, EventStatus
 
 import drakerock
 from drakerock.config import calc_config_hash
 from drakerock.errors import InputError, SimulationFailure
-from drakerock.loading.control import ENTERED, TIMEOUTS, WAYPOINT_TIMES, Mode
+from drakerock.loading.control import TIMEOUTS, WAYPOINT_TIMES, Mode
 from drakerock.loading.field import HeightField
-from drakerock.loading.performance import calc_damage, find_bucket_load, find_debris, find_events
+from drakerock.loading.performance import calc_damage, find_bucket_load, find_debris, find_events, find_lost
 from drakerock.loading.plan import DigPlan, NoPlan
+from drakerock.loading.plan_file import save_plan
 from drakerock.loading.recording import Recorder, Recording, save_recording
 from drakerock.loading.scenario import Scenario
-from drakerock.loading.signals import calc_signals, save_signals
+from drakerock.loading.signal_table import save_signals
+from drakerock.loading.signals import calc_signals
 from drakerock.loading.station import Station, make_station
 from drakerock.machine.placement import set_machine_pose
 from drakerock.pile.state import PileState, save_pile
@@ -45,13 +48,13 @@ class CycleOutcome:
         strategy: alpha, beta, gamma, kappa.
         bucket_mass_kg, bucket_rocks: the load at t4.
         weighed_mass_kg: the machine's weight on the floor as it stands after t4, less its own: what rocks it
-            carries, a cross-check of the load.
+            carries, a cross-check of the load; null where it never stood still.
         loading_time_s: t4 - t0.
         waypoint_times_s: t0 to t4; null where not passed.
         plan: swept and wanted volume, whether the wanted one could be reached, entry point, slope, dig height.
         peak_push_force_N, mean_push_force_N: of the rocks against the bucket's motion into the pile.
         energy_J: the motors' work over [t0, t4].
-        events: stalls, slips and time-outs, each with its time.
+        events: stalls, slips, time-outs, and rocks that still moved when debris was counted, with their times.
         rocks: number in all, awake at most and on average.
         wall_time_s, sim_time_s, steps, ms_per_step: cost of the cycle.
         files: names of the files with the planned and the actual tip path.
@@ -101,21 +104,23 @@ class CycleResult:
 
     Attributes:
         outcome: the numbers.
+        scenario: the resolved configuration that they come from.
         pile_before, pile_after: the rocks at the start, and when they rest again after s4.
-        in_bucket: (n,) rocks that the bucket holds at the end.
+        in_bucket: (n,) rocks that the bucket took: in it at t4, or still at the end.
         debris: (n,) rocks left loose on the floor.
-        field: the sensed height field; None if sensing was not reached.
+        field: the sensed height field.
         plan: what was planned.
         signals, units: columns (k,) of all steps, and their units.
         recording: for the replay; None if nothing ran.
     """
 
     outcome: CycleOutcome
+    scenario: Scenario
     pile_before: PileState
     pile_after: PileState
     in_bucket: NDArray[np.bool_]
     debris: NDArray[np.bool_]
-    field: HeightField | None
+    field: HeightField
     plan: DigPlan | NoPlan
     signals: dict[str, Array]
     units: dict[str, str]
@@ -140,27 +145,27 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
     simulator = Simulator(station.diagram)
     root = simulator.get_mutable_context()
     station.rocks.set_pile(root, pile)
-    config = scenario.loading
+    performance = scenario.loading.performance
     recorder = Recorder(
         station.plant, station.scene_graph, station.machine, pile, station.shapes, scenario.site,
         scenario.recording.motion_threshold,
     )  # fmt: skip
     plant_context = station.plant.GetMyMutableContextFromRoot(root)
-    _place(station, root, x_tip=-0.5 * scenario.site.drift_length, y=0.0)
-    # Sensing and planning need the rocks only; they tell where the machine starts.
+    # Sensing and planning come first: they tell where the machine starts. Only a scanner's view depends on where
+    # it stands meanwhile.
+    _place(station, root, x_tip=-scenario.loading.sensing.scanner.distance, y=0.0)
     station.diagram.ExecuteInitializationEvents(root)
     field: HeightField = station.diagram.GetOutputPort("height_field").Eval(root)
     plan: DigPlan | NoPlan = station.diagram.GetOutputPort("plan").Eval(root)
     if isinstance(plan, DigPlan):
-        _place(station, root, x_tip=float(plan.waypoint_x[0]) - config.planning.run_up, y=plan.y)
+        _place(station, root, x_tip=float(plan.waypoint_x[0]) - scenario.loading.planning.run_up, y=plan.y)
     simulator.Initialize(InitializeParams(suppress_initialization_events=True))
 
     body_poses = station.plant.get_body_poses_output_port()
     mode_port = station.diagram.GetOutputPort("mode")
     progress_port = station.diagram.GetOutputPort("progress")
     rock_port = station.diagram.GetOutputPort("rock_poses")
-    frame_time = 1.0 / scenario.recording.frame_rate
-    failure, ended_at = None, None
+    failure, weighed_at = None, None
     floor_forces: list[float] = []
 
     def record() -> Mode:
@@ -171,49 +176,55 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
             progress(mode.name, time)
         return mode
 
-    mode = record()
-    in_bucket = np.zeros(len(pile), bool)
-    pile_at_end = pile
-    window = scenario.pile.settle_window
-    last_check, last_poses = 0.0, None
+    def stop_at_s4(root_context: Context) -> EventStatus:
+        if mode_port.Eval(root_context)[0] < Mode.DONE:
+            return EventStatus.DidNothing()
+        return EventStatus.ReachedTermination(station.controller, "s4")
+
+    def find_load(pile: PileState) -> NDArray[np.bool_]:
+        bucket = station.plant.GetBodyByName("bucket", station.machine.instance)
+        return find_bucket_load(pile, station.digger.bucket, bucket.EvalPoseInWorld(plant_context))
+
+    record()
+    load, at_rest = np.zeros(len(pile), bool), True
+    pile_at_t4 = last_pile = pile
+    simulator.set_monitor(stop_at_s4)
+    frame, last_check = 0, 0.0
     try:
         while not isinstance(plan, NoPlan):
-            simulator.AdvanceTo(root.get_time() + frame_time)
-            mode = record()
-            time = root.get_time()
-            if mode < Mode.DONE:
+            frame += 1
+            simulator.AdvanceTo(frame / scenario.recording.frame_rate)
+            if weighed_at is None and mode_port.Eval(root)[0] >= Mode.DONE:
+                simulator.clear_monitor()
+                weighed_at = last_check = root.get_time()
+                pile_at_t4 = last_pile = station.rocks.get_pile(root)
+                load = find_load(pile_at_t4)
+                simulator.AdvanceTo(frame / scenario.recording.frame_rate)
+            record()
+            if weighed_at is None:
                 continue
-            if ended_at is None:
-                ended_at = float(progress_port.Eval(root)[ENTERED])
-                pile_at_end = station.rocks.get_pile(root)
-                bucket = station.plant.GetBodyByName("bucket", station.machine.instance)
-                in_bucket = find_bucket_load(
-                    pile_at_end, station.digger.bucket, bucket.EvalPoseInWorld(plant_context)
-                )
-                last_check, last_poses = time, pile_at_end.p_WRs
-            elif time - last_check >= window - 1e-9 and last_poses is not None:
-                poses = station.rocks.get_pile(root).p_WRs
-                moved = np.linalg.norm(poses - last_poses, axis=1)
-                if np.percentile(moved, 99) < config.performance.rest_speed * window:
-                    break
-                last_check, last_poses = time, poses
-            # The first half second is left out of the weighing: the machine brakes and rocks.
-            if time - ended_at > 0.5:
+            time = root.get_time()
+            if time - weighed_at >= performance.weighing_delay:
                 floor_forces.append(_calc_floor_force(station, plant_context))
-            if time - ended_at >= config.performance.settle_time:
-                break
+            if time - last_check >= performance.rest_window - 1e-9:
+                now = station.rocks.get_pile(root)
+                moved = np.linalg.norm(now.p_WRs - last_pile.p_WRs, axis=1)[~load]
+                at_rest = bool(np.all(moved < performance.rest_speed * (time - last_check)))
+                last_check, last_pile = time, now
+                late = time - weighed_at >= performance.settle_time
+                if floor_forces and (at_rest or late):
+                    break
     except (RuntimeError, SimulationFailure) as error:
         failure = f"solver failure at {root.get_time():.2f} s: {error}"
 
     pile_after = station.rocks.get_pile(root)
     signals, units = calc_signals(station, root)
     controller = np.array(progress_port.Eval(root))
-    if ended_at is not None:
-        bucket = station.plant.GetBodyByName("bucket", station.machine.instance)
-        held = find_bucket_load(pile_after, station.digger.bucket, bucket.EvalPoseInWorld(plant_context))
-        debris = find_debris(pile_after, station.shapes, in_bucket | held, scenario.pile.contact_gap)
-    else:
-        held, debris = in_bucket, np.zeros(len(pile), bool)
+    in_bucket, debris = load, np.zeros(len(pile), bool)
+    if weighed_at is not None and failure is None:
+        in_bucket = load | find_load(pile_after)
+        gone = in_bucket | find_lost(pile_after, scenario.site)
+        debris = find_debris(pile_after, station.shapes, gone, scenario.pile.contact_gap)
 
     weighed = None
     if floor_forces:
@@ -221,7 +232,7 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
         own = station.plant.CalcTotalMass(plant_context, [station.machine.instance])
         weighed = float(np.mean(floor_forces)) / gravity - own
     outcome = _make_outcome(
-        scenario, station, pile_at_end, plan, controller, signals, in_bucket, debris, weighed, failure,
+        scenario, station, pile_at_t4, plan, controller, signals, load, debris, weighed, failure, at_rest,
         wall_time=clock.perf_counter() - start,
     )  # fmt: skip
     recording = recorder.finish(
@@ -235,12 +246,14 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
             "versions": outcome.versions,
         }
     )
-    return CycleResult(outcome, pile, pile_after, held, debris, field, plan, signals, units, recording)
+    return CycleResult(
+        outcome, scenario, pile, pile_after, in_bucket, debris, field, plan, signals, units, recording
+    )
 
 
 def save_cycle(result: CycleResult, folder: str | Path) -> list[Path]:
-    """Write a cycle's files: outcome.json, signals.parquet, plan.json, pile_before.npz, pile_after.npz,
-    recording.npz.
+    """Write a cycle's files: outcome.json, signals.parquet, plan.json, scenario.json, pile_before.npz,
+    pile_after.npz, recording.npz.
 
     Returns:
         The paths written; outcome.json is the last, so that a folder with it is complete.
@@ -250,20 +263,13 @@ def save_cycle(result: CycleResult, folder: str | Path) -> list[Path]:
     """
     folder = Path(folder)
     make_folder(folder)
-    plan: dict[str, Any] = (
-        result.plan.to_dict() if isinstance(result.plan, DigPlan) else {"reason": result.plan.reason}
-    )
-    if result.field is not None:
-        plan["height_field"] = {
-            "x": result.field.x.tolist(), "y": result.field.y.tolist(),
-            "h": np.round(result.field.h, 4).tolist(), "cell": result.field.cell,
-        }  # fmt: skip
     save_pile(result.pile_before, folder / "pile_before.npz")
     save_pile(result.pile_after, folder / "pile_after.npz")
     save_signals(result.signals, result.units, folder / "signals.parquet")
     if result.recording is not None:
         save_recording(result.recording, folder / "recording.npz")
-    write_text(folder / "plan.json", json.dumps(plan))
+    save_plan(result.plan, result.field, folder / "plan.json")
+    write_text(folder / "scenario.json", result.scenario.model_dump_json(indent=2) + "\n")
     write_text(folder / "outcome.json", result.outcome.to_json())
     names = [
         "pile_before.npz",
@@ -271,6 +277,7 @@ def save_cycle(result: CycleResult, folder: str | Path) -> list[Path]:
         "signals.parquet",
         "recording.npz",
         "plan.json",
+        "scenario.json",
         "outcome.json",
     ]
     return [folder / name for name in names if (folder / name).exists()]
@@ -339,6 +346,7 @@ def _make_outcome(
     debris: NDArray[np.bool_],
     weighed: float | None,
     failure: str | None,
+    at_rest: bool,
     wall_time: float,
 ) -> CycleOutcome:
     volumes = np.array([shape.volume for shape in station.shapes])
@@ -366,6 +374,10 @@ def _make_outcome(
         energy = float(
             np.interp(times[4], time, signals["work"]) - np.interp(times[0], time, signals["work"])
         )
+    config = scenario.loading
+    events = find_events(signals, controller[TIMEOUTS], times, config.performance, config.planning.v_x_max)
+    if not at_rest:
+        events.append({"event": "rocks not at rest", "time_s": float(time[-1])})
     steps = max(len(time) - 1, 0)
     planned: dict[str, Any]
     if isinstance(plan, DigPlan):
@@ -398,13 +410,7 @@ def _make_outcome(
         peak_push_force_N=peak,
         mean_push_force_N=mean,
         energy_J=energy,
-        events=find_events(
-            signals,
-            controller[TIMEOUTS],
-            times,
-            scenario.loading.performance,
-            scenario.loading.planning.v_x_max,
-        ),
+        events=events,
         rocks={
             "total": len(pile),
             "awake_max": int(signals["n_awake"].max()) if len(time) else 0,

@@ -12,6 +12,7 @@ from pydrake.math import RigidTransform
 from drakerock.dynamics.contact_graph import find_loose
 from drakerock.loading.config import PerformanceConfig
 from drakerock.machine.geometry import BucketGeometry
+from drakerock.pile.config import SiteConfig
 from drakerock.pile.shapes import RockShape
 from drakerock.pile.state import PileState
 
@@ -41,19 +42,26 @@ def calc_damage(time: Array, moment: Array, start: float, end: float, config: Pe
     return float(np.sum(excess[inside]) * step / config.t_char)
 
 
+def find_lost(pile: PileState, site: SiteConfig) -> NDArray[np.bool_]:
+    """Return which rocks (n,) are not in drift or void: those that left the site lie on no floor."""
+    half = 0.5 * site.drift_width
+    low, high = [-site.drift_length, -half, 0.0], [site.void_depth, half, np.inf]
+    return np.any((pile.p_WRs < low) | (pile.p_WRs > high), axis=1)
+
+
 def find_debris(
-    pile: PileState, shapes: tuple[RockShape, ...], in_bucket: NDArray[np.bool_], gap: float
+    pile: PileState, shapes: tuple[RockShape, ...], gone: NDArray[np.bool_], gap: float
 ) -> NDArray[np.bool_]:
-    """Return which rocks (n,) are debris: neither in the bucket nor connected to the pile by contacts.
+    """Return which rocks (n,) are debris: neither gone nor connected to the pile by contacts.
 
     Args:
         pile: all rocks at rest, fixed ones included.
         shapes: the rock shapes.
-        in_bucket: (n,) rocks that the bucket holds.
+        gone: (n,) rocks in the bucket or out of the site.
         gap: rocks nearer than this touch [m].
     """
     debris = np.zeros(len(pile), bool)
-    debris[~in_bucket] = find_loose(pile.select(~in_bucket), shapes, gap)
+    debris[~gone] = find_loose(pile.select(~gone), shapes, gap)
     return debris
 
 

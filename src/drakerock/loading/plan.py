@@ -8,7 +8,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drakerock.machine.kinematics import Kinematics, calc_joint_rates
+
 Array = NDArray[np.float64]
+
+
+def calc_motor_rates(
+    kin: Kinematics, phi_l: float, phi_b: float, v_x: float, v_z: float, omega: float
+) -> Array:
+    """Return the rates (wheel, boom, bucket) [rad/s] for a tip velocity, clamped to the motors' limits.
+
+    The plan is integrated with the rates that the controller will ask for, limits included (section 5, speeds).
+
+    Args:
+        kin: the machine's geometry and limits.
+        phi_l, phi_b: boom and bucket angle [rad].
+        v_x, v_z: tip velocity [m/s].
+        omega: curl rate, nose-up positive [rad/s].
+    """
+    return clamp_rates(kin, calc_joint_rates(kin, phi_l, phi_b, v_x, v_z, omega))
+
+
+def clamp_rates(kin: Kinematics, rates: Array) -> Array:
+    """Return the rates (wheel, boom, bucket) clamped to the motors' limits [rad/s]."""
+    limits = np.array([kin.wheel_speed, kin.boom_speed, kin.bucket_speed])
+    return np.clip(rates, -limits, limits)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,14 +14,13 @@ from scipy.optimize import brentq
 
 from drakerock.loading.config import PlanningConfig, SensingConfig, StrategyConfig
 from drakerock.loading.field import HeightField, PileProfile, calc_pile_profile
-from drakerock.loading.plan import DigPlan, NoPlan, SpeedTable
+from drakerock.loading.plan import DigPlan, NoPlan, SpeedTable, calc_motor_rates
 from drakerock.machine.geometry import BucketGeometry, calc_heaped_capacity
 from drakerock.machine.kinematics import (
     Kinematics,
     calc_bucket_range,
     calc_full_tilt,
     calc_joint_angles,
-    calc_joint_rates,
     calc_pitch,
     calc_tip,
 )
@@ -165,7 +165,7 @@ def make_dig_plan(
         return NoPlan(f"the machine ({machine.width:.2f} m wide) does not fit the drift ({drift_width:g} m)")
     entry = choose_entry_slice(profile, strategy.gamma, half_room)
     if entry is None:
-        return NoPlan("no candidate slice holds any pile")
+        return NoPlan("none that the machine fits into holds any pile")
     y = float(profile.y[entry])
     near = np.isfinite(profile.slope) & (np.abs(profile.y - y) <= 0.5 * width)
     slope = float(np.mean(profile.slope[near]))
@@ -200,20 +200,36 @@ def make_dig_plan(
     def calc_excess(depth: float) -> float:
         return calc_swept_volume(calc_swept(depth), field, y, width) - wanted
 
-    low, high = calc_excess(0.0), calc_excess(depth_max)
-    reached = bool(low <= 0.0 <= high)
-    if reached and depth_max > 0:
-        depth = float(brentq(calc_excess, 0.0, depth_max, xtol=1e-4))
-    else:
-        depth = 0.0 if low > 0.0 else depth_max
-        reached = bool(abs(calc_excess(depth)) <= 0.01 * wanted)
+    depth = _solve_depth(calc_excess, depth_max, field.cell)
     swept = calc_swept(depth)
     volume = calc_swept_volume(swept, field, y, width)
+    reached = bool(abs(volume - wanted) <= 0.01 * wanted)
     return _assemble(
         x_s0, depth, dig, tables, kin, config,
         y=y, slope=slope, h_s2=h_s2, psi_m=psi_m, volume=volume, volume_wanted=wanted, reached=reached,
         swept=swept,
     )  # fmt: skip
+
+
+def _solve_depth(calc_excess: Callable[[float], float], depth_max: float, step: float) -> float:
+    """Return a depth in [0, depth_max] [m] with no excess, or where there is none, that of the least one.
+
+    Args:
+        calc_excess: swept less wanted volume of a depth; it grows with the depth unless the pile has hollows.
+        depth_max: [m].
+        step: how densely an uneven pile's depths are looked through [m].
+    """
+    depths = np.array([0.0, depth_max])
+    excess = np.array([calc_excess(depth) for depth in depths])
+    if excess[0] * excess[1] > 0.0 and depth_max > step:
+        depths = np.linspace(0.0, depth_max, 1 + int(np.ceil(depth_max / step)))
+        inner = [calc_excess(float(depth)) for depth in depths[1:-1]]
+        excess = np.array([excess[0], *inner, excess[1]])
+    crossings = np.flatnonzero(excess[:-1] * excess[1:] <= 0.0)
+    if len(crossings) == 0:
+        return float(depths[np.argmin(np.abs(excess))])
+    first = int(crossings[0])
+    return float(brentq(calc_excess, depths[first], depths[first + 1], xtol=1e-4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,28 +307,33 @@ def _make_tables(
 def _integrate_lift(
     tables: _Tables, phi_l: float, phi_b: float, kin: Kinematics, config: PlanningConfig
 ) -> _Path:
-    """Integrate [s1, s2] as the controller would drive it on a machine that follows exactly."""
+    """Integrate [s1, s2] as the controller would drive it on a machine that follows exactly.
+
+    The motors' limits bind here as they do there; beyond a joint's stop nothing moves.
+    """
     length, height = tables.v_x.at[-1], tables.v_z.at[-1]
     psi_end = tables.omega.at[-1]
     # Fine steps, so that the three coordinates reach the waypoint together; one in eight is kept.
     fine = 8
     dt = length / config.v_x_max / (config.n_segment * fine)
-    z0 = float(calc_tip(kin, 0.0, phi_l, phi_b)[1])
+    x_tip, z0 = (float(value) for value in calc_tip(kin, 0.0, phi_l, phi_b))
     rows = [(0.0, 0.0, 0.0, phi_l, phi_b, 0.0)]
     x = z = psi = t = 0.0
     while x < length - 1e-9 and z < height - 1e-9:
         v_x = tables.v_x.calc(x)
-        step = min(dt, (length - x) / v_x)
+        # The last step ends at the waypoint; its lower bound lets the clamped wheels get there.
+        step = min(dt, max((length - x) / v_x, 1e-3 * dt))
         v_z = tables.v_z.calc(z)
-        omega = tables.omega.calc(psi) if psi < psi_end else 0.0
-        step_turn = min(omega * step, psi_end - psi) if psi_end > 0 else 0.0
-        _, d_l, d_b = calc_joint_rates(kin, phi_l, phi_b, v_x * step, v_z * step, step_turn)
-        phi_l = max(phi_l + d_l, float(kin.phi_l_range[0]))
+        omega = min(tables.omega.calc(psi), (psi_end - psi) / step) if psi < psi_end else 0.0
+        wheel, boom, bucket = calc_motor_rates(kin, phi_l, phi_b, v_x, v_z, omega)
+        phi_l = max(phi_l + boom * step, float(kin.phi_l_range[0]))
         stop, _ = calc_bucket_range(kin, phi_l)
-        phi_b = max(phi_b + d_b, float(stop))
-        x, t = x + v_x * step, t + step
+        phi_b = max(phi_b + bucket * step, float(stop))
+        t += step
         psi = float(calc_pitch(kin, phi_l, phi_b))
-        z = float(calc_tip(kin, 0.0, phi_l, phi_b)[1]) - z0
+        x_last = x_tip
+        x_tip, z_tip = (float(value) for value in calc_tip(kin, 0.0, phi_l, phi_b))
+        x, z = x + kin.wheel_radius * wheel * step + x_tip - x_last, z_tip - z0
         rows.append((x, z, psi, phi_l, phi_b, t))
     rows = rows[:-1:fine] + rows[-1:]
     return _Path(*np.array(rows).T)
@@ -380,7 +401,7 @@ def _assemble(
 
 
 class DigPlanner(LeafSystem):
-    """Plans once, when the Diagram is initialised, from what the sensor sees then.
+    """Plans once, when the Diagram is initialised, from what the sensor sees then, or takes a stored plan.
 
     Input port:
         ``height_field``: abstract, a `HeightField` in W.
@@ -397,11 +418,13 @@ class DigPlanner(LeafSystem):
         sensing: SensingConfig,
         drift_width: float,
         speed_floor: float,
+        stored: DigPlan | NoPlan | None = None,
     ) -> None:
-        """Make the planner of one strategy."""
+        """Make the planner of one strategy; arguments as of `make_dig_plan`, or a `stored` plan to give out."""
         super().__init__()
         self.set_name("dig_planner")
         self._arguments = (strategy, machine, config, sensing, drift_width, speed_floor)
+        self._stored = stored
         empty = HeightField(np.zeros(0), np.zeros(0), np.zeros((0, 0)), sensing.cell)
         self._field = self.DeclareAbstractInputPort("height_field", AbstractValue.Make(empty))
         self._plan = self.DeclareAbstractState(AbstractValue.Make(NoPlan("not initialised")))
@@ -409,5 +432,7 @@ class DigPlanner(LeafSystem):
         self.DeclareStateOutputPort("plan", self._plan)
 
     def _initialize(self, context: Context, state: State) -> None:
-        field = self._field.Eval(context)
-        state.get_mutable_abstract_state(int(self._plan)).set_value(make_dig_plan(field, *self._arguments))
+        plan = self._stored
+        if plan is None:
+            plan = make_dig_plan(self._field.Eval(context), *self._arguments)
+        state.get_mutable_abstract_state(int(self._plan)).set_value(plan)

@@ -29,14 +29,17 @@ def run_sequence(
 
     Each loading has its own subfolder, whose ``outcome.json`` is written last and at once, after the pile that
     the next loading starts from. Called again with the same folder, the sequence goes on after the last
-    complete loading, and ends with the same outcomes, bit for bit, as one that was never interrupted. After a
-    failed loading the next one starts from the same pile.
+    complete loading, and ends with the same outcomes, bit for bit, as one that was never interrupted. A failed
+    loading is the last: from the same pile the next one would fail in the same way.
 
     Args:
         scenario: the configuration; its seed also seeds the refills.
         n_loadings: how many.
         folder: where the loadings' subfolders are.
         progress: called as things proceed.
+
+    Returns:
+        The outcomes, fewer than `n_loadings` after a failure.
 
     Raises:
         InputError: bad configuration, a folder that cannot be written or that holds another sequence.
@@ -53,6 +56,8 @@ def run_sequence(
             done = _run_loading(scenario, pile, number, place, progress)
         outcome, pile = done
         outcomes.append(outcome)
+        if outcome.status == "failed":
+            break
     return outcomes
 
 
@@ -91,6 +96,8 @@ def _run_loading(
 
 def make_next_pile(scenario: Scenario, result: CycleResult, number: int) -> PileState:
     """Return the pile for the next loading: bucket emptied, debris removed, void refilled, all at rest.
+
+    After a failed loading it is the pile before it.
 
     Args:
         scenario: the configuration.

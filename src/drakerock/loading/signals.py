@@ -1,17 +1,12 @@
-"""The time-stamped signals of a cycle as one table, with units."""
+"""The time-stamped signals of a cycle: columns and units from the logs."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
 from drakerock.dynamics.interface import ROCK_SUMMARY
-from drakerock.errors import InputError
 from drakerock.loading.station import Station
 from drakerock.machine.measurement import MEASUREMENT
 from drakerock.machine.names import WHEEL_JOINTS
@@ -25,9 +20,10 @@ FORCE_NAMES = ("bucket_torque_x", "bucket_torque_y", "bucket_torque_z",
 def calc_signals(station: Station, root_context: Context) -> tuple[dict[str, Array], dict[str, str]]:
     """Return the columns (k,) of all logged steps, and their units.
 
-    A row holds what is so when the step at ``time`` begins and the forces that act over that step. Powers are
-    motor torque times joint rate, work its sum over time since the start, slip the difference of the wheels'
-    circumferential speed and the front unit's.
+    A row holds what is so when the step at ``time`` begins, before any update at that time, and the forces
+    and torques that act over that step. Powers are motor torque times the mean joint rate of the step, so that
+    their sum over time, the work since the start, balances the kinetic energy of a discrete step. Slip is the
+    difference of the wheels' circumferential speed and the front unit's.
     """
     data = {name: log.FindLog(root_context).data() for name, log in station.logs.items()}
     time = station.logs["mode"].FindLog(root_context).sample_times()
@@ -44,6 +40,10 @@ def calc_signals(station: Station, root_context: Context) -> tuple[dict[str, Arr
         data["motor_speeds"],
     )
     add({"hinge_moment": "N m"}, data["hinge_moment"])
+    if station.scenario.dynamics.rocks == "nonsmooth":
+        # That engine reports on the step taken last; a row holds the step that begins.
+        for name in ("F_B_W", "rock_summary"):
+            data[name] = np.concatenate([data[name][:, 1:], data[name][:, -1:]], axis=1)
     add(dict.fromkeys(FORCE_NAMES[:3], "N m") | dict.fromkeys(FORCE_NAMES[3:], "N"), data["F_B_W"])
     add(ROCK_SUMMARY, data["rock_summary"])
 
@@ -62,24 +62,11 @@ def calc_signals(station: Station, root_context: Context) -> tuple[dict[str, Arr
         torque = data["torques"][[row_of_torque[joint] for joint in members]]
         rate = data["machine_state"][n_q:][[row_of_rate[joint] for joint in members]]
         columns[f"torque_{name}"], units[f"torque_{name}"] = torque.sum(axis=0), "N m"
-        power = (torque * rate).sum(axis=0)
+        following = np.concatenate([rate[:, 1:], rate[:, -1:]], axis=1)
+        power = (torque * 0.5 * (rate + following)).sum(axis=0)
         columns[f"power_{name}"], units[f"power_{name}"] = power, "W"
         total += power
     columns["work"], units["work"] = np.concatenate([[0.0], np.cumsum(total[:-1]) * step]), "J"
     wheel_speed = columns["wheel_rate"] * station.digger.kinematics.wheel_radius
     columns["wheel_slip"], units["wheel_slip"] = wheel_speed - columns["v_F"], "m/s"
     return columns, units
-
-
-def save_signals(columns: dict[str, Array], units: dict[str, str], path: str | Path) -> None:
-    """Write the columns as Parquet; each column's unit is in its field's metadata under ``unit``.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    schema = pa.schema([pa.field(name, pa.float64(), metadata={"unit": units[name]}) for name in columns])
-    table = pa.table([pa.array(column) for column in columns.values()], schema=schema)
-    try:
-        pq.write_table(table, path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error}") from None

@@ -16,6 +16,7 @@ from drakerock.dynamics.interface import RockSystem
 from drakerock.dynamics.nonsmooth.system import NonsmoothRocks, add_nonsmooth_rocks
 from drakerock.dynamics.plant.rocks import PlantRocks, add_plant_rocks, add_rock_bodies
 from drakerock.loading.control import FeedforwardController
+from drakerock.loading.plan_file import load_plan
 from drakerock.loading.planning import DiggingMachine, DigPlanner
 from drakerock.loading.scenario import Scenario
 from drakerock.loading.sensing import PileSensor
@@ -92,7 +93,7 @@ def make_station(scenario: Scenario, pile: PileState) -> Station:
         pile: the rocks; their poses are written into a context by ``station.rocks.set_pile``.
 
     Raises:
-        InputError: the machine's SDFormat file or a rock mesh cannot be used.
+        InputError: the machine's SDFormat file, a rock mesh or a stored plan cannot be used.
     """
     dynamics, loading = scenario.dynamics, scenario.loading
     shapes = load_rock_shapes(scenario.rocks.shapes)
@@ -124,9 +125,20 @@ def make_station(scenario: Scenario, pile: PileState) -> Station:
     )
     machine_sensor = add_machine_sensor(builder, plant, machine, kinematics)
     pile_sensor = builder.AddSystem(
-        PileSensor(pile, shapes, scenario.site, loading.sensing, scenario.site.drift_length / 2)
+        PileSensor(
+            pile,
+            shapes,
+            scenario.site,
+            loading.sensing,
+            scenario.site.drift_length / 2,
+            seed=scenario.seed,
+            front_unit=plant.GetBodyByName("front_unit", machine.instance).index(),
+        )
     )
+    if loading.sensing.kind == "scanner":
+        builder.Connect(plant.get_body_poses_output_port(), pile_sensor.GetInputPort("body_poses"))
     builder.Connect(rocks.GetOutputPort("rock_poses"), pile_sensor.GetInputPort("rock_poses"))
+    source = loading.planning.source
     planner = builder.AddSystem(
         DigPlanner(
             loading.strategy,
@@ -135,6 +147,7 @@ def make_station(scenario: Scenario, pile: PileState) -> Station:
             loading.sensing,
             scenario.site.drift_width,
             loading.control.speed_floor,
+            stored=None if source is None else load_plan(source)[0],
         )
     )
     builder.Connect(pile_sensor.GetOutputPort("height_field"), planner.GetInputPort("height_field"))

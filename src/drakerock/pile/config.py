@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 from pydantic import Field, model_validator
@@ -57,12 +58,18 @@ class SiteConfig(Config):
     drift_height: Annotated[float, Field(gt=1, le=20, description="at the crown [m]")] = 5.0
     roof_sag: Annotated[float, Field(ge=0, le=3, description="crown above the roof's springing [m]")] = 0.4
     drift_length: Annotated[float, Field(gt=5, le=200, description="[m]")] = 40.0
-    void_depth: Annotated[float, Field(gt=0.5, le=50, description="brow to rear wall, at the floor [m]")] = (
-        5.0
-    )
+    void_depth: Annotated[float, Field(gt=0.5, le=50, description="brow to rear wall [m]")] = 8.6
     void_height: Annotated[
         float, Field(gt=1, le=60, description="height of the walls above the floor [m]")
     ] = 12.0
+    rear_layer: Annotated[
+        float,
+        Field(ge=0, le=10, description="thickness of the static rocks on the rear wall, 0: none [m]"),
+    ] = 1.0
+    void_taper_deg: Annotated[
+        float,
+        Field(ge=0, le=30, description="lean of the void's side and rear walls inwards, towards the floor"),
+    ] = 0.0
     wall_lean_deg: Annotated[
         float,
         Field(
@@ -79,6 +86,11 @@ class SiteConfig(Config):
             raise ValueError("roof_sag must be below half of drift_height")
         if self.void_height < self.drift_height:
             raise ValueError("void_height must be at least drift_height")
+        if self.rear_layer and self.rear_layer > self.void_depth - 0.5:
+            raise ValueError("rear_layer must leave 0.5 m of void_depth (0: no static rocks)")
+        foot = self.void_height * math.tan(math.radians(self.void_taper_deg))
+        if foot and (foot > 0.25 * self.drift_width or foot > 0.25 * self.void_depth):
+            raise ValueError("void_taper_deg must leave half of the void's width and depth at the floor")
         return self
 
 
@@ -88,20 +100,30 @@ class PileConfig(Config):
     source: Annotated[str | None, Field(description="a stored pile (.npz) to take instead of making one")] = (
         None
     )
-    rocks: Annotated[int, Field(gt=0, le=100_000, description="number of moving rocks to emit")] = 240
-    emission_height: Annotated[
-        float,
-        Field(gt=0, le=60, description="rocks are emitted between the pile's surface and this height [m]"),
-    ] = 4.4
+    rocks: Annotated[
+        int | None,
+        Field(
+            gt=0,
+            le=100_000,
+            description="number of moving rocks to emit; null: until the void is full to the emitter",
+        ),
+    ] = None
+    emission_height: Annotated[float, Field(gt=0, le=60, description="underside of the emitter [m]")] = 8.0
     emission_reach: Annotated[
         float, Field(ge=0, le=50, description="how far before the brow rocks are emitted [m]")
-    ] = 2.4
-    batch_time: Annotated[float, Field(gt=0, le=10, description="time between emitted batches [s]")] = 1.0
+    ] = 0.0
+    emission_interval: Annotated[
+        float, Field(ge=0.1, le=2, description="time between emitted batches [s]")
+    ] = 0.5
     settle_speed: Annotated[
         float, Field(gt=0, description="at rest when 99 % of the rocks are slower than this [m/s]")
-    ] = 0.05
+    ] = 0.002
     settle_window: Annotated[float, Field(gt=0, description="... by displacement over this time [s]")] = 0.5
-    max_time: Annotated[float, Field(gt=0, description="give up settling after this time [s]")] = 15.0
+    max_time: Annotated[float, Field(gt=0, description="give up settling after this time [s]")] = 30.0
+    balance_time: Annotated[
+        float,
+        Field(gt=0, le=30, description="then all rocks are awake for this time: forces find balance [s]"),
+    ] = 1.0
     contact_gap: Annotated[
         float,
         Field(ge=0, le=0.1, description="rocks nearer than this touch: debris is what touches no pile [m]"),

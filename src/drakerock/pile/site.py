@@ -48,7 +48,7 @@ class Site:
     Attributes:
         config: what it was made from.
         planes: floor, side walls, rear wall.
-        pieces: roof with the face above the brow.
+        pieces: roof with the face above the brow; what the void tapers by.
     """
 
     config: SiteConfig
@@ -87,7 +87,34 @@ def make_site(config: SiteConfig, n_roof: int = 8) -> Site:
                 corners.append([x, wide, z])
             corners += [[-config.drift_length, wide, top], [-lean * (top - config.drift_height), wide, top]]
         pieces.append(ConvexPiece(f"roof_{k}", np.array(corners)))
+    if config.void_taper_deg:
+        pieces += _make_taper(config)
     return Site(config, planes, tuple(pieces))
+
+
+def make_confined_site(config: SiteConfig) -> Site:
+    """Build the mould of the rear layer: the void's walls, and a plane in front of the rear wall."""
+    site = make_site(config)
+    taper = np.deg2rad(config.void_taper_deg)
+    # Parallel to the rear wall, on the layer's other side.
+    normal = np.array([np.cos(taper), 0.0, -np.sin(taper)])
+    on_wall = np.array([config.void_depth, 0.0, config.void_height])
+    plane = Plane("confining_plane", normal, float(normal @ on_wall) - config.rear_layer)
+    taper_pieces = tuple(piece for piece in site.pieces if piece.name.startswith("taper"))
+    return Site(config, (*site.planes, plane), taper_pieces)
+
+
+def _make_taper(config: SiteConfig) -> list[ConvexPiece]:
+    """Return wedges on the void's side and rear walls, thickest at the floor."""
+    half, depth, top = 0.5 * config.drift_width, config.void_depth, config.void_height
+    foot = top * np.tan(np.deg2rad(config.void_taper_deg))
+    rear = [[depth, y, z] for y in (-half, half) for z in (0.0, top)]
+    pieces = [ConvexPiece("taper_rear", np.array(rear + [[depth - foot, y, 0.0] for y in (-half, half)]))]
+    for name, side in (("taper_left", 1.0), ("taper_right", -1.0)):
+        wall = [[x, side * half, z] for x in (0.0, depth) for z in (0.0, top)]
+        edge = [[x, side * (half - foot), 0.0] for x in (0.0, depth)]
+        pieces.append(ConvexPiece(name, np.array(wall + edge)))
+    return pieces
 
 
 def calc_roof_height(config: SiteConfig, y: float | Array) -> float | Array:

@@ -23,20 +23,26 @@ class ContactMemory:
     Attributes:
         pairs: (c, 2) indices of the rocks in contact, the lower first; -1, -2, ... as the second stand for the
             site's pieces, then its planes. Points of one pair are in line.
-        points: (c, 3) positions in the frame of the pair's first rock [m].
-        impulses: (c, 3) impulse of a time step on the second, in W [N s].
+        points: (c, 3) positions in the frame of the pair's first rock [m]; single precision, here as in the file,
+            so that a pile goes on the same, bit for bit, whether it was stored in between or not.
+        impulses: (c, 3) impulse of a time step on the second, in W [N s]; single precision.
         resting: (n,) True for rocks that the model reduction had at rest.
     """
 
     pairs: NDArray[np.int64]
-    points: Array
-    impulses: Array
+    points: NDArray[np.floating[Any]]
+    impulses: NDArray[np.floating[Any]]
     resting: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        for name in ("points", "impulses"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), np.float32))
 
     def select(self, rocks: NDArray[np.int64], n: int) -> ContactMemory:
         """Return the contacts among the chosen rocks (indices into n rocks), renumbered.
 
-        Pairs whose rocks change order are left out, since points belong to the first rock's frame.
+        Pairs whose rocks change order are left out, since points belong to the first rock's frame. A rock that
+        loses a contact so no longer rests: what held it may be gone.
         """
         number = np.full(n, -1, np.int64)
         number[rocks] = np.arange(len(rocks))
@@ -44,11 +50,14 @@ class ContactMemory:
         new_first = number[first]
         new_second = np.where(second < 0, second, number[np.maximum(second, 0)])
         kept = (new_first >= 0) & ((second < 0) | (new_second > new_first))
+        resting = self.resting.copy()
+        resting[first[~kept]] = False
+        resting[second[~kept & (second >= 0)]] = False
         return ContactMemory(
             np.column_stack([new_first, new_second])[kept],
             self.points[kept],
             self.impulses[kept],
-            self.resting[rocks],
+            resting[rocks],
         )
 
     def join(self, other: ContactMemory) -> ContactMemory:
@@ -66,7 +75,10 @@ class ContactMemory:
 def make_empty_contacts(n: int) -> ContactMemory:
     """Return the memory of n rocks without contacts."""
     return ContactMemory(
-        np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(n, np.bool_)
+        np.zeros((0, 2), np.int64),
+        np.zeros((0, 3), np.float32),
+        np.zeros((0, 3), np.float32),
+        np.zeros(n, np.bool_),
     )
 
 

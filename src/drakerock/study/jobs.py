@@ -7,13 +7,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from drakerock.dynamics.settling import fetch_pile
+import numpy as np
+
+from drakerock.dynamics.settling import calc_creep, fetch_pile
+from drakerock.exploration.noise import calc_standard_error
 from drakerock.loading.cycle import CycleOutcome, make_folder, run_cycle, save_cycle, write_text
 from drakerock.loading.scenario import Scenario, make_recipe
+from drakerock.loading.sequence import run_sequence
 from drakerock.pile.shapes import load_rock_shapes
+from drakerock.pile.site import make_site
 from drakerock.pile.state import PileState, save_pile
 from drakerock.pile.summary import calc_summary
+from drakerock.viewing.cycle_figures import write_cycle_figures
 from drakerock.viewing.pile_figures import write_pile_picture
+from drakerock.viewing.pile_page import write_pile_page
 from drakerock.viewing.replay import write_replay
 
 
@@ -28,7 +35,7 @@ def get_pile(scenario: Scenario, progress: Callable[..., None] | None = None) ->
 
 
 def run_and_save(
-    scenario: Scenario, folder: Path, progress: Callable[..., None]
+    scenario: Scenario, folder: Path, progress: Callable[..., None], *, figures: bool = False
 ) -> tuple[CycleOutcome, list[Path]]:
     """Get the pile, run the cycle, write its files and the replay.
 
@@ -36,6 +43,7 @@ def run_and_save(
         scenario: the configuration.
         folder: where to write.
         progress: called with stage, share in [0, 1] or None, and a note.
+        figures: whether to write the pictures, too.
 
     Raises:
         InputError: bad configuration, or the folder cannot be written.
@@ -51,27 +59,113 @@ def run_and_save(
     if result.recording is not None:
         write_replay(result.recording, folder / "replay.html")
         paths.append(folder / "replay.html")
+        if figures:
+            progress("drawing", None)
+            paths += write_cycle_figures(folder)
     return result.outcome, paths
+
+
+def run_and_save_sequence(
+    scenario: Scenario,
+    n_loadings: int,
+    folder: Path,
+    progress: Callable[..., None],
+    *,
+    figures: bool = False,
+) -> tuple[dict[str, Any], list[Path]]:
+    """Run or resume a sequence of loadings, and write its summary.
+
+    Args:
+        scenario: the configuration.
+        n_loadings: how many.
+        folder: where to write: loading_00, loading_01, ... with a cycle's files each, and sequence.json.
+        progress: called with stage, share in [0, 1] or None, and a note.
+        figures: whether to write each loading's pictures, too.
+
+    Returns:
+        The summary (`calc_sequence_summary`), and the paths written.
+
+    Raises:
+        InputError: bad configuration, a folder that cannot be written or that holds another sequence.
+        SimulationFailure: the pile could not be made or refilled.
+    """
+
+    def tell(number: int, stage: str, time: float) -> None:
+        note = f"loading {number + 1} of {n_loadings}, {time:.1f} s simulated"
+        progress(stage, number / n_loadings, note=note)
+
+    outcomes = run_sequence(scenario, n_loadings, folder, progress=tell)
+    places = [folder / f"loading_{number:02d}" for number in range(len(outcomes))]
+    if figures:
+        for place in places:
+            progress("drawing", None, note=place.name)
+            write_cycle_figures(place)
+    summary = calc_sequence_summary(outcomes)
+    write_text(folder / "sequence.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+    return summary, [*places, folder / "sequence.json"]
+
+
+def calc_sequence_summary(outcomes: list[CycleOutcome]) -> dict[str, Any]:
+    """Return what a sequence came to: per quantity mean, spread and standard error, and what ended each loading.
+
+    The spread is the standard deviation of single loadings; the standard error of the mean allows for
+    successive loadings resembling each other (`drakerock.exploration.noise`). Failed loadings count in neither;
+    null where there are too few values.
+    """
+    objectives = ("production", "damage", "debris")
+    values = {name: [outcome.objectives[name] for outcome in outcomes] for name in objectives}
+    for name in ("bucket_mass_kg", "loading_time_s", "energy_J", "wall_time_s"):
+        values[name] = [getattr(outcome, name) for outcome in outcomes]
+    return {
+        "loadings": len(outcomes),
+        "failed": sum(outcome.status == "failed" for outcome in outcomes),
+        "strategy": outcomes[0].strategy if outcomes else None,
+        "reasons": [outcome.reason for outcome in outcomes],
+        "quantities": {name: _summarise(column) for name, column in values.items()},
+        "scenario_hash": outcomes[0].scenario_hash if outcomes else None,
+    }
+
+
+def _summarise(values: list[float | None]) -> dict[str, Any]:
+    array = np.array([np.nan if value is None else value for value in values], dtype=float)
+    good = array[np.isfinite(array)]
+    return {
+        "mean": float(good.mean()) if len(good) else None,
+        "spread": float(good.std(ddof=1)) if len(good) > 1 else None,
+        "standard_error": calc_standard_error(array) if len(good) > 1 else None,
+        "values": values,
+    }
 
 
 def make_pile_files(
     scenario: Scenario, folder: Path, progress: Callable[..., None]
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Make or fetch the scenario's pile and write pile.npz, pile.json and pile.png.
+    """Make or fetch the scenario's pile and write pile.npz, pile.json, pile.png and pile.html.
 
     Returns:
-        The summary, and the paths written.
+        The summary, and the paths written. ``at_rest`` is measured: all rocks are woken for half a second.
 
     Raises:
         InputError: bad configuration, or the folder cannot be written.
         SimulationFailure: the pile could not be made.
     """
     make_folder(folder)
-    pile, source = fetch_pile(make_recipe(scenario), progress)
+    recipe = make_recipe(scenario)
+    pile, source = fetch_pile(recipe, progress)
     shapes = load_rock_shapes(scenario.rocks.shapes)
-    summary = calc_summary(pile, shapes, scenario.rocks) | {"taken_from": str(source)}
-    paths = [folder / "pile.npz", folder / "pile.json", folder / "pile.png"]
+    progress("measuring", None)
+    site = make_site(scenario.site)
+    moved = calc_creep(pile, shapes, recipe, scenario.pile.settle_window)
+    p99 = float(np.percentile(moved, 99)) if len(moved) else 0.0
+    summary = calc_summary(pile, shapes, scenario.rocks, site, scenario.dynamics.time_step) | {
+        "at_rest": p99 < scenario.pile.settle_speed * scenario.pile.settle_window,
+        "creep_mm_p99": round(1e3 * p99, 3),
+        "taken_from": str(source),
+    }
+    progress("writing", None)
+    paths = [folder / name for name in ("pile.npz", "pile.json", "pile.png", "pile.html")]
     save_pile(pile, paths[0])
     write_text(paths[1], json.dumps(summary | {"provenance": pile.provenance}, indent=2) + "\n")
     write_pile_picture(pile, shapes, scenario.site, paths[2])
+    write_pile_page(pile, shapes, scenario.site, paths[3])
     return summary, paths

@@ -9,16 +9,12 @@ from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Meshcat, MeshcatAnimation, MeshcatParams, Rgba
 from pydrake.math import RigidTransform
-from scipy.spatial.transform import Rotation
 
-from drakerock.errors import InputError
 from drakerock.loading.recording import Recording
-from drakerock.pile.config import SiteConfig
+from drakerock.viewing.scene import calc_rock_colors, draw_site, draw_still_rocks, write_scene
 
 Array = NDArray[np.float64]
 
-# Warm greys by size class, told apart by lightness alone; the floor is darker than any rock.
-_ROCK_LIGHTNESS = (0.42, 0.78)
 _MOVED_TINT = np.array([0.10, 0.04, -0.06])
 
 
@@ -33,7 +29,7 @@ def write_replay(recording: Recording, path: str | Path) -> None:
         InputError: the file cannot be written.
     """
     meshcat = Meshcat(MeshcatParams(show_stats_plot=False))
-    _draw_site(meshcat, recording.site, _find_view_start(recording))
+    draw_site(meshcat, recording.site, _find_view_start(recording))
     for k, visual in enumerate(recording.visuals):
         body = f"machine/{visual.body}_{recording.bodies[visual.body]}"
         meshcat.SetTriangleMesh(f"{body}/{k}", visual.vertices.T, visual.triangles.T, Rgba(*visual.rgba))
@@ -58,10 +54,7 @@ def write_replay(recording: Recording, path: str | Path) -> None:
     animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     meshcat.SetAnimation(animation)
     _set_camera(meshcat, recording)
-    try:
-        Path(path).write_text(meshcat.StaticHtml(), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    write_scene(meshcat, path)
 
 
 def _animate_rock(animation: MeshcatAnimation, recording: Recording, rock: int) -> None:
@@ -79,62 +72,20 @@ def _animate_rock(animation: MeshcatAnimation, recording: Recording, rock: int) 
 
 
 def _draw_rocks(meshcat: Meshcat, recording: Recording, moving: NDArray[np.int32]) -> None:
-    sizes = np.unique(recording.rock_size)
-    shade = dict(zip(sizes, np.linspace(*_ROCK_LIGHTNESS, len(sizes)), strict=True))
-    is_moving = np.zeros(len(recording.rock_size), bool)
-    is_moving[moving] = True
-    for rock in np.flatnonzero(is_moving):
+    colors = calc_rock_colors(recording.rock_size)
+    still = np.ones(len(recording.rock_size), bool)
+    still[moving] = False
+    for rock in np.flatnonzero(~still):
         vertices, triangles = recording.rock_shapes[recording.rock_shape[rock]]
-        color = np.clip(np.array([1.0, 0.96, 0.9]) * shade[recording.rock_size[rock]] + _MOVED_TINT, 0, 1)
+        color = np.clip(colors[recording.rock_size[rock]] + _MOVED_TINT, 0, 1)
         meshcat.SetTriangleMesh(
             f"rocks/moving/{rock}", (recording.rock_size[rock] * vertices).T, triangles.T, Rgba(*color, 1.0)
         )
         meshcat.SetTransform(f"rocks/moving/{rock}", _to_transform(recording.X_WRs[rock]))
-    for size in sizes:
-        group = np.flatnonzero((recording.rock_size == size) & ~is_moving)
-        if len(group) == 0:
-            continue
-        corners, faces, offset = [], [], 0
-        for rock in group:
-            vertices, triangles = recording.rock_shapes[recording.rock_shape[rock]]
-            R_WR = Rotation.from_quat(recording.X_WRs[rock, :4], scalar_first=True).as_matrix()
-            corners.append(size * vertices @ R_WR.T + recording.X_WRs[rock, 4:])
-            faces.append(triangles + offset)
-            offset += len(vertices)
-        color = np.array([1.0, 0.96, 0.9]) * shade[size]
-        meshcat.SetTriangleMesh(
-            f"rocks/resting/{size:g}", np.concatenate(corners).T, np.concatenate(faces).T, Rgba(*color, 1.0)
-        )
-
-
-def _draw_site(meshcat: Meshcat, site: SiteConfig, x_start: float) -> None:
-    """Draw floor, far wall, rear wall and the rock above the brow; the near wall would hide the machine."""
-    half, end, height = 0.5 * site.drift_width, site.void_depth, site.drift_height
-    floor = np.array([[x_start, -half, 0], [end, -half, 0], [end, half, 0], [x_start, half, 0]], float)
-    far = np.array([[x_start, half, 0], [end, half, 0], [end, half, height], [x_start, half, height]], float)
-    rear = np.array([[end, -half, 0], [end, half, 0], [end, half, height], [end, -half, height]], float)
-    quads = np.array([[0, 1, 2], [0, 2, 3]])
-    for name, corners, rgba in (
-        ("floor", floor, Rgba(0.30, 0.29, 0.28)),
-        ("far_wall", far, Rgba(0.45, 0.44, 0.43, 0.55)),
-        ("rear_wall", rear, Rgba(0.38, 0.37, 0.36, 0.55)),
-    ):
-        # Both sides, so that a wall shows from wherever the camera is turned to.
-        meshcat.SetTriangleMesh(f"site/{name}", corners.T, np.vstack([quads, quads[:, ::-1]]).T, rgba)
-    lean = np.tan(np.deg2rad(site.wall_lean_deg)) * (site.void_height - height)
-    brow = np.array([[x_start, half, height], [0, half, height], [-lean, half, site.void_height]], float)
-    outline = np.vstack([brow, brow[::-1] * [1, -1, 1]])
-    meshcat.SetLine("site/brow", outline.T, 2.0, Rgba(0.2, 0.2, 0.2))
-    meshcat.SetProperty("/Background/<object>", "top_color", [0.93, 0.94, 0.96])
-    meshcat.SetProperty("/Background/<object>", "bottom_color", [0.75, 0.76, 0.78])
-    meshcat.SetProperty("/Grid/<object>", "visible", False)
-    meshcat.SetProperty("/Axes/<object>", "visible", False)
-    # Even light over a scene of tens of metres: the viewer's own lamps light one of a few metres.
-    for lamp in ("PointLightNegativeX", "PointLightPositiveX", "SpotLight"):
-        meshcat.SetProperty(f"/Lights/{lamp}/<object>", "intensity", 0.0)
-    meshcat.SetProperty("/Lights/AmbientLight/<object>", "intensity", 1.3)
-    meshcat.SetProperty("/Lights/FillLight/<object>", "intensity", 2.2)
-    meshcat.SetProperty("/Lights/FillLight/<object>", "position", [-6.0, 14.0, 9.0])
+    draw_still_rocks(
+        meshcat, "rocks/resting", recording.rock_shapes, recording.rock_shape[still], recording.rock_size[still],
+        recording.X_WRs[still], colors,
+    )  # fmt: skip
 
 
 def _find_view_start(recording: Recording) -> float:

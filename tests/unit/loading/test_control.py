@@ -37,7 +37,7 @@ def drive(plan, digger, config, blocked=()):
         psi = float(calc_pitch(kin, phi_l, phi_b))
         state = (x, float(tip[1]), psi)
         passed = calc_passed(plan, mode, kin, *state, phi_l, phi_b)
-        if passed or time - entered > calc_allowed_time(plan, mode, config.timeout):
+        if passed or time - entered > calc_allowed_time(plan, mode, config):
             times.append(time)
             timeouts.append(not passed)
             mode, entered = Mode(mode + 1), time

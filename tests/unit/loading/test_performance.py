@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from drakerock.loading.config import PerformanceConfig
-from drakerock.loading.performance import calc_damage, find_bucket_load, find_debris, find_events
+from drakerock.loading.performance import calc_damage, find_bucket_load, find_debris, find_events, find_lost
+from drakerock.pile.config import SiteConfig
 
 CONFIG = PerformanceConfig()
 
@@ -69,6 +70,12 @@ def test_a_body_with_a_fixed_rock_is_pile_however_small(heap, shapes):
     fixed[-1] = True
     pile = replace(heap, p_WRs=p_WRs, fixed=fixed)
     assert not find_debris(pile, shapes, np.zeros(n, bool), 0.005).any()
+
+
+def test_rocks_out_of_the_site_are_lost(heap):
+    p_WRs = heap.p_WRs.copy()
+    p_WRs[0], p_WRs[1], p_WRs[2], p_WRs[3] = [-1, 4, 1], [-1, 0, -3], [9, 0, 1], [-50, 0, 1]
+    assert list(np.flatnonzero(find_lost(replace(heap, p_WRs=p_WRs), SiteConfig()))) == [0, 1, 2, 3]
 
 
 def test_events_have_times_and_do_not_count_turns():

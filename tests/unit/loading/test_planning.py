@@ -10,6 +10,7 @@ from drakerock.loading.config import PlanningConfig, SensingConfig, StrategyConf
 from drakerock.loading.field import PileProfile
 from drakerock.loading.plan import DigPlan, NoPlan
 from drakerock.loading.planning import (
+    _solve_depth,
     calc_halt,
     calc_swept_volume,
     choose_entry_slice,
@@ -131,6 +132,30 @@ def test_too_much_even_without_driving_in_is_flagged(digger):
     assert not plan.reached
     assert plan.volume > plan.volume_wanted
     assert plan.waypoint_x[1] == plan.waypoint_x[0]
+
+
+def test_depth_of_least_excess_where_nothing_fits():
+    depth = _solve_depth(lambda d: 2.0 + (d - 1.3) ** 2, 4.0, 0.1)
+    assert depth == pytest.approx(1.3, abs=0.06)
+    assert _solve_depth(lambda d: -2.0 + d, 1.0, 0.1) == 1.0
+    assert _solve_depth(lambda d: 2.0 + d, 1.0, 0.1) == 0.0
+    # Both ends lack, the middle does not: the first crossing.
+    assert _solve_depth(lambda d: 1.0 - (d - 2.0) ** 2, 4.0, 0.1) == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("slope", [0.9, 1.25])
+def test_planned_rates_are_within_the_motors_limits(digger, slope):
+    kin = digger.kinematics
+    plan = plan_for(digger, make_wedge(slope, toe=-5.0), alpha=0.5, beta=1.0, kappa=1.0)
+    dt = np.diff(plan.t)
+    moving = dt > 1e-6
+    for angle, limit in ((plan.phi_l, kin.boom_speed), (plan.phi_b, kin.bucket_speed)):
+        assert np.abs(np.diff(angle)[moving] / dt[moving]).max() <= limit * (1 + 1e-6)
+    # What boom and bucket do not give to the tip's x, the wheels do.
+    wheel = np.diff(plan.x - calc_tip(kin, 0.0, plan.phi_l, plan.phi_b)[:, 0]) / kin.wheel_radius
+    assert np.abs(wheel[moving] / dt[moving]).max() <= kin.wheel_speed * (1 + 1e-6)
+    # The turn asked for on [s1, s2] is far beyond the limit: the rest of it is left to [s2, s3].
+    assert plan.waypoint_psi[3] == pytest.approx(plan.psi_m, abs=1e-6)
 
 
 def test_empty_drift_and_narrow_drift_have_no_plan(digger):

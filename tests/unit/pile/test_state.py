@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drakerock.errors import InputError
-from drakerock.pile.state import PileState, load_pile, save_pile
+from drakerock.pile.state import ContactMemory, PileState, load_pile, save_pile
 
 
 def test_round_trip_is_exact(heap, tmp_path):
@@ -65,3 +65,49 @@ def test_select_and_join_are_inverse(heap):
     order = np.argsort(np.concatenate([np.flatnonzero(mask), np.flatnonzero(~mask)]))
     assert np.array_equal(joined.p_WRs[order], heap.p_WRs)
     assert isinstance(joined, PileState)
+
+
+def test_a_rock_that_loses_a_contact_no_longer_rests(heap):
+    contacts = ContactMemory(
+        np.array([[0, 1], [1, 2], [3, -1]]), np.zeros((3, 3)), np.ones((3, 3)), np.ones(len(heap), bool)
+    )
+    pile = replace(heap, contacts=contacts)
+    kept = np.arange(len(heap)) != 1
+    rest = pile.select(kept).contacts
+    assert np.array_equal(rest.pairs, [[2, -1]])  # rock 3 on the site, renumbered
+    assert list(np.flatnonzero(~rest.resting)) == [0, 1]  # rocks 0 and 2 leant on rock 1
+
+
+def make_contacts():
+    rng = np.random.default_rng(4)
+    pairs = np.array([[0, 1], [0, 3], [2, 5], [4, -9], [1, -9]])
+    return ContactMemory(pairs, rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), np.arange(12) % 2 == 0)
+
+
+def test_contact_forces_keep_their_bits_through_the_file(heap, tmp_path):
+    pile = replace(heap, contacts=make_contacts())
+    save_pile(pile, tmp_path / "pile.npz")
+    back = load_pile(tmp_path / "pile.npz")
+    for name in ("pairs", "points", "impulses", "resting"):
+        one, two = getattr(back.contacts, name), getattr(pile.contacts, name)
+        assert one.dtype == two.dtype
+        assert np.array_equal(one, two), name
+
+
+def test_contacts_are_renumbered_with_their_rocks(heap):
+    pile = replace(heap, contacts=make_contacts())
+    some = pile.select(np.array([0, 1, 4]))
+    assert some.contacts.pairs.tolist() == [[0, 1], [2, -9], [1, -9]]
+    assert np.array_equal(some.contacts.impulses, pile.contacts.impulses[[0, 3, 4]])
+    both = heap.join(pile)
+    assert both.contacts.pairs[0].tolist() == [12, 13]
+    assert both.contacts.pairs[3].tolist() == [16, -9]
+    assert both.contacts.resting.sum() == 6
+
+
+def test_contacts_of_unknown_rocks_are_refused(heap):
+    contacts = make_contacts()
+    with pytest.raises(ValueError, match="not in the pile"):
+        replace(heap, contacts=replace(contacts, pairs=contacts.pairs + 9))
+    with pytest.raises(ValueError, match="impulses"):
+        replace(heap, contacts=replace(contacts, impulses=np.full((5, 3), np.nan)))

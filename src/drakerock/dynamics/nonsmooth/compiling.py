@@ -11,12 +11,17 @@ import logging
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
 import platformdirs
+from numpy.typing import NDArray
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+# Types of the kernels' arguments: arrays of any number type, a rotation by rows, a vector in three numbers.
+Array = NDArray[Any]
+Rotation = tuple[float, float, float, float, float, float, float, float, float]
+Vector = tuple[float, float, float]
+
 _log = logging.getLogger(__name__)
 
 # Fused multiply-adds and reordered sums, but NaN and infinity stay what they are, so that they can be found.
@@ -34,7 +39,7 @@ def find_cache_folder() -> Path:
     return Path(base) / f"kernels-{digest.hexdigest()[:12]}"
 
 
-def kernel(function: Function) -> Function:
+def kernel[Function: Callable[..., Any]](function: Function) -> Function:
     """Decorate a function over arrays and numbers to be compiled on first use and cached on disk."""
     # numba reads its cache folder when it decorates; other users of numba must not see ours.
     before = numba.config.CACHE_DIR

@@ -7,7 +7,7 @@ is kept in.
 
 from __future__ import annotations
 
-from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, kernel
 
 # Columns of a contact row. All vectors in W; impulses act on body B, and reversed on body A.
 NORMAL = 0  # 0..2 unit normal from A to B
@@ -39,12 +39,12 @@ KEY_STEP = 1 << 20
 
 
 @kernel
-def _hash(key, mask):
+def _hash(key: int, mask: int) -> int:
     return ((key * -7046029254386353131) >> 40) & mask
 
 
 @kernel
-def index_memory(memory, n_memory, table):
+def index_memory(memory: Array, n_memory: int, table: Array) -> None:
     """Set a hash table from a pair's key to the first of its rows in memory (rows of a pair are in line).
 
     Args:
@@ -66,7 +66,7 @@ def index_memory(memory, n_memory, table):
 
 
 @kernel
-def find_in_memory(key, memory, table):
+def find_in_memory(key: int, memory: Array, table: Array) -> int:
     """Return the first row of a pair in memory, or -1."""
     mask = len(table) - 1
     place = _hash(key, mask)
@@ -78,14 +78,25 @@ def find_in_memory(key, memory, table):
 
 
 @kernel
-def find_axis(key, axis_keys):
+def find_axis(key: int, axis_keys: Array) -> tuple[int, bool]:
     """Return the place of a pair in the cache of separating axes, and whether it is the pair's own."""
     place = _hash(key, len(axis_keys) - 1)
     return place, axis_keys[place] == key
 
 
 @kernel
-def write_memory(n_rocks, status, old, n_old, rows, n_rows, row_key, row_rock, rotations, new):
+def write_memory(
+    n_rocks: int,
+    status: Array,
+    old: Array,
+    n_old: int,
+    rows: Array,
+    n_rows: int,
+    row_key: Array,
+    row_rock: Array,
+    rotations: Array,
+    new: Array,
+) -> int:
     """Write the memory of the coming step: the loaded points just solved, and all points between rocks at rest.
 
     Args:
@@ -134,7 +145,7 @@ def write_memory(n_rocks, status, old, n_old, rows, n_rows, row_key, row_rock, r
 
 
 @kernel
-def sum_impulses(memory, n_memory, n_rocks, sums):
+def sum_impulses(memory: Array, n_memory: int, n_rocks: int, sums: Array) -> None:
     """Set `sums` (n, 3) to the sum of the contact impulses on each rock [N s]."""
     sums[:] = 0.0
     for row in range(n_memory):

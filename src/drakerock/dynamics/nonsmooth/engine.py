@@ -106,6 +106,7 @@ class StepReport:
         max_penetration, p99_penetration: of loaded points [m].
         n_woken, n_rested, n_lost: rocks that changed state (lost: left the site) in this step.
         redone: the step was solved again with more iterations.
+        flagged: residual or penetration are beyond the bounds of the settings all the same.
         overflow: loaded points that memory could not take.
     """
 
@@ -121,6 +122,7 @@ class StepReport:
     n_rested: int
     n_lost: int
     redone: bool
+    flagged: bool
     overflow: int
 
 
@@ -391,6 +393,9 @@ class NonsmoothEngine:
         Raises:
             SimulationFailure: the result is not finite, also when solved again more carefully.
         """
+        for name in ("positions", "quaternions", "velocities"):
+            if not np.isfinite(getattr(arrays, name)).all():
+                raise SimulationFailure(f"rocks: {name} that are not finite")
         iterations = self.config.iterations
         new, report = self._try_step(arrays, machine, iterations, warm=True)
         if new is not None and report is not None and report.residual <= self.config.max_residual:
@@ -485,6 +490,7 @@ class NonsmoothEngine:
         )  # fmt: skip
         loaded = rows[:n_rows, contacts.IMPULSE] > 0.0
         depths = -rows[:n_rows, contacts.GAP][loaded]
+        max_penetration = float(depths.max(initial=0.0))
         report = StepReport(
             F_Bs_W=self._sum_machine_forces(n_rows, n_impacts > 0),
             machine_velocity=velocity,
@@ -492,12 +498,13 @@ class NonsmoothEngine:
             n_contacts=n_rows,
             n_loaded=int(loaded.sum()),
             residual=residual,
-            max_penetration=float(depths.max(initial=0.0)),
+            max_penetration=max_penetration,
             p99_penetration=float(_calc_percentile(depths, 0.99)),
             n_woken=n_woken,
             n_rested=n_rested,
             n_lost=n_lost,
             redone=False,
+            flagged=residual > config.max_residual or max_penetration > config.max_penetration,
             overflow=n_memory - new.n_memory,
         )
         return new, report

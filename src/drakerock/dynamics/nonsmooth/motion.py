@@ -7,12 +7,17 @@ import math
 import numpy as np
 
 from drakerock.dynamics.nonsmooth.collision.broad_phase import rotate_inertia
-from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, Vector, kernel
 from drakerock.dynamics.nonsmooth.solver import INVERSE_INERTIA, INVERSE_MASS
+
+# No sum of a rock's coordinates and velocities is larger; NaN is not smaller either.
+HUGE = 1e9
 
 
 @kernel
-def turn(w, x, y, z, ax, ay, az):
+def turn(
+    w: float, x: float, y: float, z: float, ax: float, ay: float, az: float
+) -> tuple[float, float, float, float]:
     """Return the unit quaternion q turned by the rotation vector a (in W): exp(a) q."""
     angle2 = ax * ax + ay * ay + az * az
     half = 0.5 * math.sqrt(angle2)
@@ -28,7 +33,7 @@ def turn(w, x, y, z, ax, ay, az):
 
 
 @kernel
-def _make_rotation(w, x, y, z):
+def _make_rotation(w: float, x: float, y: float, z: float) -> Rotation:
     return (
         1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
         2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
@@ -37,7 +42,7 @@ def _make_rotation(w, x, y, z):
 
 
 @kernel
-def _solve_symmetric(m, i, x, y, z):
+def _solve_symmetric(m: Array, i: int, x: float, y: float, z: float) -> Vector:
     """Return M^-1 (x, y, z) for row i of symmetric matrices (xx xy xz yy yz zz)."""
     a, b, c, d, e, f = m[i, 0], m[i, 1], m[i, 2], m[i, 3], m[i, 4], m[i, 5]
     c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
@@ -51,7 +56,9 @@ def _solve_symmetric(m, i, x, y, z):
 
 
 @kernel
-def set_bodies(awake, velocities, inverse_mass, inverse_inertia, bodies):
+def set_bodies(
+    awake: Array, velocities: Array, inverse_mass: Array, inverse_inertia: Array, bodies: Array
+) -> None:
     """Set the bodies of the solve: awake rocks with their inertia, all others immovable and at rest.
 
     Args:
@@ -71,7 +78,7 @@ def set_bodies(awake, velocities, inverse_mass, inverse_inertia, bodies):
 
 
 @kernel
-def add_gravity(awake, bodies, change):
+def add_gravity(awake: Array, bodies: Array, change: Array) -> None:
     """Add gravity's change of velocity over a step (3,) to the awake rocks."""
     for s in range(len(awake)):
         for d in range(3):
@@ -79,7 +86,15 @@ def add_gravity(awake, bodies, change):
 
 
 @kernel
-def move(awake, bodies, inverse_inertia_local, time_step, quaternions, positions, velocities):
+def move(
+    awake: Array,
+    bodies: Array,
+    inverse_inertia_local: Array,
+    time_step: float,
+    quaternions: Array,
+    positions: Array,
+    velocities: Array,
+) -> bool:
     """Advance the awake rocks' poses with their new velocities.
 
     Free spin keeps the angular momentum: the rotation is taken with the angular velocity at the middle of the
@@ -125,6 +140,7 @@ def move(awake, bodies, inverse_inertia_local, time_step, quaternions, positions
         total = qw + qx + qy + qz
         for d in range(3):
             total += positions[i, d] + velocities[i, d] + velocities[i, 3 + d]
-        if not math.isfinite(total):
+        # Not math.isfinite: with sums reordered it is compiled to True.
+        if not abs(total) < HUGE:
             sane = False
     return sane

@@ -8,7 +8,7 @@ the refinement sensor in front of the bucket.
 from __future__ import annotations
 
 from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, LOST, RESTING
-from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, kernel
 
 # Columns of a rock's bookkeeping (all stored in the context).
 STATUS = 0
@@ -20,7 +20,7 @@ BOOK_WIDTH = 9
 
 
 @kernel
-def is_sensed(x, y, z, radius, sensors):
+def is_sensed(x: float, y: float, z: float, radius: float, sensors: Array) -> bool:
     """Return whether a sphere meets one of the boxes (k, 18): rotation by rows, position, lower, upper."""
     for s in range(len(sensors)):
         box = sensors[s]
@@ -36,7 +36,16 @@ def is_sensed(x, y, z, radius, sensors):
 
 
 @kernel
-def wake(book, positions, radius, mass, sums, sensors, load, steps):
+def wake(
+    book: Array,
+    positions: Array,
+    radius: Array,
+    mass: Array,
+    sums: Array,
+    sensors: Array,
+    load: float,
+    steps: int,
+) -> int:
     """Wake resting rocks.
 
     Args:
@@ -69,7 +78,7 @@ def wake(book, positions, radius, mass, sums, sensors, load, steps):
 
 
 @kernel
-def wake_rock(book, positions, i):
+def wake_rock(book: Array, positions: Array, i: int) -> None:
     """Make one rock awake."""
     book[i, STATUS] = AWAKE
     book[i, STILL_TIME] = 0.0
@@ -80,9 +89,20 @@ def wake_rock(book, positions, i):
 
 @kernel
 def rest(
-    book, positions, velocities, radius, sums, sensors, time_step, displacement, time, speed, lower, upper,
-    may_rest,
-):  # fmt: skip
+    book: Array,
+    positions: Array,
+    velocities: Array,
+    radius: Array,
+    sums: Array,
+    sensors: Array,
+    time_step: float,
+    displacement: float,
+    time: float,
+    speed: float,
+    lower: Array,
+    upper: Array,
+    may_rest: bool,
+) -> tuple[int, int]:
     """Let awake rocks come to rest, and take those that left the site out.
 
     Args:

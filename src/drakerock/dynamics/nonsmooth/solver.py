@@ -9,12 +9,12 @@ solved as one system.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, Vector, kernel
 from drakerock.dynamics.nonsmooth.contacts import (
     ARM_A,
     ARM_B,
@@ -73,8 +73,8 @@ class MachineArrays(NamedTuple):
         rows: (m, v) what each row measures.
         row_response: (m, v) change of the generalised velocities by a unit of each row's impulse.
         row_values: (m, MACHINE_ROW_WIDTH): velocity aimed at, compliance, least and greatest impulse,
-            1 / (diagonal + compliance), impulse, and for friction rows the row of the normal impulse that
-            multiplies the limits (else -1).
+            1 / (diagonal + compliance), impulse, and for friction rows, which come in pairs, the row of the normal
+            impulse that multiplies the limits (else -1).
     """
 
     jacobian: NDArray[np.float64]
@@ -86,7 +86,7 @@ class MachineArrays(NamedTuple):
 
 
 @kernel
-def _apply_inertia(body, x, y, z):
+def _apply_inertia(body: Array, x: float, y: float, z: float) -> Vector:
     return (
         body[INVERSE_INERTIA] * x + body[INVERSE_INERTIA + 1] * y + body[INVERSE_INERTIA + 2] * z,
         body[INVERSE_INERTIA + 1] * x + body[INVERSE_INERTIA + 3] * y + body[INVERSE_INERTIA + 4] * z,
@@ -95,7 +95,7 @@ def _apply_inertia(body, x, y, z):
 
 
 @kernel
-def _push(body, rx, ry, rz, px, py, pz, sign):
+def _push(body: Array, rx: float, ry: float, rz: float, px: float, py: float, pz: float, sign: float) -> None:
     """Change a body's velocities by an impulse p at arm r."""
     ux, uy, uz = _apply_inertia(body, ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px)
     factor = sign * body[INVERSE_MASS]
@@ -108,7 +108,7 @@ def _push(body, rx, ry, rz, px, py, pz, sign):
 
 
 @kernel
-def _push_machine(machine, velocity, b, impulse):
+def _push_machine(machine: MachineArrays, velocity: Array, b: int, impulse: Array) -> None:
     """Change the machine's velocities by a spatial impulse (6,) on its body b at its origin."""
     response = machine.response[b]
     for k in range(len(velocity)):
@@ -117,7 +117,7 @@ def _push_machine(machine, velocity, b, impulse):
 
 
 @kernel
-def _calc_body_velocity(machine, velocity, b, spatial):
+def _calc_body_velocity(machine: MachineArrays, velocity: Array, b: int, spatial: Array) -> None:
     """Set the spatial velocity (6,) of the machine's body b at its origin."""
     jacobian = machine.jacobian[b]
     for d in range(6):
@@ -128,10 +128,10 @@ def _calc_body_velocity(machine, velocity, b, spatial):
 
 
 @kernel
-def _add_mobility(body, rx, ry, rz, mobility):
+def _add_mobility(body: Array, rx: float, ry: float, rz: float, mobility: Array) -> None:
     """Add a rock's point mobility (velocity of the point per impulse at it; xx xy xz yy yz zz)."""
     # - [r]x I^-1 [r]x, column by column
-    c0x, c0y, c0z = _apply_inertia(body, 0.0, rz, -ry)
+    _, c0y, c0z = _apply_inertia(body, 0.0, rz, -ry)
     c1x, c1y, c1z = _apply_inertia(body, -rz, 0.0, rx)
     c2x, c2y, c2z = _apply_inertia(body, ry, -rx, 0.0)
     inverse_mass = body[INVERSE_MASS]
@@ -144,7 +144,7 @@ def _add_mobility(body, rx, ry, rz, mobility):
 
 
 @kernel
-def _add_machine_mobility(m, rx, ry, rz, mobility):
+def _add_machine_mobility(m: Array, rx: float, ry: float, rz: float, mobility: Array) -> None:
     """Add the mobility at arm r of a machine body with the spatial mobility m (6, 6)."""
     # P m P^T with P = (-[r]x, 1), the map from a spatial velocity to the point's velocity
     p = ((0.0, rz, -ry), (-rz, 0.0, rx), (ry, -rx, 0.0))
@@ -161,7 +161,7 @@ def _add_machine_mobility(m, rx, ry, rz, mobility):
 
 
 @kernel
-def _quadratic(m, ax, ay, az, bx, by, bz):
+def _quadratic(m: Array, ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> float:
     """Return a^T M b of a symmetric M (xx xy xz yy yz zz)."""
     return (
         ax * (m[0] * bx + m[1] * by + m[2] * bz)
@@ -171,7 +171,7 @@ def _quadratic(m, ax, ay, az, bx, by, bz):
 
 
 @kernel
-def _relative_velocity(row, body_a, body_b):
+def _relative_velocity(row: Array, body_a: Array, body_b: Array) -> Vector:
     """Return the velocity of B's point against A's."""
     ax, ay, az = row[ARM_A], row[ARM_A + 1], row[ARM_A + 2]
     bx, by, bz = row[ARM_B], row[ARM_B + 1], row[ARM_B + 2]
@@ -183,7 +183,7 @@ def _relative_velocity(row, body_a, body_b):
 
 
 @kernel
-def _relative_velocity_machine(row, body_a, spatial):
+def _relative_velocity_machine(row: Array, body_a: Array, spatial: Array) -> Vector:
     """Return the velocity of a point of a machine body, of spatial velocity (6,), against A's."""
     bx, by, bz = row[ARM_B], row[ARM_B + 1], row[ARM_B + 2]
     ax, ay, az = row[ARM_A], row[ARM_A + 1], row[ARM_A + 2]
@@ -196,9 +196,21 @@ def _relative_velocity_machine(row, body_a, spatial):
 
 @kernel
 def prepare_rows(
-    rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity, curvature, hertz,
-    time_step, upsilon, max_recovery_speed, impact_threshold,
-):  # fmt: skip
+    rows: Array,
+    n_rows: int,
+    body_a: Array,
+    body_b: Array,
+    bodies: Array,
+    n_rocks: int,
+    machine: MachineArrays,
+    velocity: Array,
+    curvature: Array,
+    hertz: float,
+    time_step: float,
+    upsilon: float,
+    max_recovery_speed: float,
+    impact_threshold: float,
+) -> None:
     """Set the solver's columns of the contact rows.
 
     Args:
@@ -272,7 +284,7 @@ def prepare_rows(
 
 
 @kernel
-def _solve_row(row, dx, dy, dz):
+def _solve_row(row: Array, dx: float, dy: float, dz: float) -> tuple[float, float, float, float]:
     """Update a row's impulses for the relative velocity d; return the impulse's change in W and its normal part."""
     nx, ny, nz = row[NORMAL], row[NORMAL + 1], row[NORMAL + 2]
     old = row[IMPULSE]
@@ -312,7 +324,7 @@ def _solve_row(row, dx, dy, dz):
 
 
 @kernel
-def _solve_contact(row, body_a, body_b):
+def _solve_contact(row: Array, body_a: Array, body_b: Array) -> float:
     """Update one contact and its two rocks' velocities; return the change of its normal impulse."""
     dx, dy, dz = _relative_velocity(row, body_a, body_b)
     px, py, pz, change = _solve_row(row, dx, dy, dz)
@@ -323,12 +335,12 @@ def _solve_contact(row, body_a, body_b):
 
 
 @kernel
-def _solve_packed(rows, k, bodies, a, b):
+def _solve_packed(rows: Array, k: int, bodies: Array, a: int, b: int) -> float:
     """The same as `_solve_contact` in single precision, written out: this is where the time goes.
 
     It takes arrays and indices: views of rows would be counted as references, which costs more than the rest.
     """
-    zero = np.float32(0.0)
+    zero: Any = np.float32(0.0)
     nx, ny, nz = rows[k, NORMAL], rows[k, NORMAL + 1], rows[k, NORMAL + 2]
     ax, ay, az = rows[k, ARM_A], rows[k, ARM_A + 1], rows[k, ARM_A + 2]
     bx, by, bz = rows[k, ARM_B], rows[k, ARM_B + 1], rows[k, ARM_B + 2]
@@ -405,7 +417,16 @@ def _solve_packed(rows, k, bodies, a, b):
 
 
 @kernel
-def _solve_machine_contacts(rows, order, body_a, body_b, bodies, n_rocks, machine, velocity):
+def _solve_machine_contacts(
+    rows: Array,
+    order: Array,
+    body_a: Array,
+    body_b: Array,
+    bodies: Array,
+    n_rocks: int,
+    machine: MachineArrays,
+    velocity: Array,
+) -> float:
     """Update the machine's contacts in `order`; return the sum of the changes of their normal impulses.
 
     Contacts of one body in line share its spatial velocity; the whole machine is told when the body changes.
@@ -443,7 +464,7 @@ def _solve_machine_contacts(rows, order, body_a, body_b, bodies, n_rocks, machin
 
 
 @kernel
-def _find_machine_rows(n_rows, body_b, n_rocks):
+def _find_machine_rows(n_rows: int, body_b: Array, n_rocks: int) -> int:
     """Return the first of the machine's contacts; they are the last rows."""
     first = n_rows
     while first > 0 and body_b[first - 1] > n_rocks:
@@ -452,31 +473,62 @@ def _find_machine_rows(n_rows, body_b, n_rocks):
 
 
 @kernel
-def _solve_machine_rows(machine, velocity):
-    """Sweep over the machine's own rows: motors, stops, tyres."""
+def _calc_row_impulse(machine: MachineArrays, velocity: Array, k: int) -> float:
+    """Return what the impulse of the machine's row k has to be, limits left aside."""
     values = machine.row_values
-    for _ in range(MACHINE_SWEEPS):
-        for k in range(len(values)):
-            lower, upper = values[k, LOWER], values[k, UPPER]
-            normal = int(values[k, NORMAL_ROW])
-            if normal >= 0:
-                lower *= values[normal, ROW_IMPULSE]
-                upper *= values[normal, ROW_IMPULSE]
-            measured = 0.0
-            for d in range(len(velocity)):
-                measured += machine.rows[k, d] * velocity[d]
-            old = values[k, ROW_IMPULSE]
-            new = old + (values[k, TARGET] - measured - values[k, ROW_COMPLIANCE] * old) * values[k, ROW_MASS]
-            new = min(max(new, lower), upper)
-            change = new - old
-            if change != 0.0:
-                values[k, ROW_IMPULSE] = new
-                for d in range(len(velocity)):
-                    velocity[d] += machine.row_response[k, d] * change
+    measured = 0.0
+    for d in range(len(velocity)):
+        measured += machine.rows[k, d] * velocity[d]
+    old = values[k, ROW_IMPULSE]
+    return old + (values[k, TARGET] - measured - values[k, ROW_COMPLIANCE] * old) * values[k, ROW_MASS]
 
 
 @kernel
-def apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity):
+def _set_row_impulse(machine: MachineArrays, velocity: Array, k: int, impulse: float) -> None:
+    """Set the impulse of the machine's row k, and the velocities accordingly."""
+    change = impulse - machine.row_values[k, ROW_IMPULSE]
+    if change != 0.0:
+        machine.row_values[k, ROW_IMPULSE] = impulse
+        for d in range(len(velocity)):
+            velocity[d] += machine.row_response[k, d] * change
+
+
+@kernel
+def _solve_machine_rows(machine: MachineArrays, velocity: Array) -> None:
+    """Sweep over the machine's own rows: motors, stops, tyres. A normal row is followed by its two of friction."""
+    values = machine.row_values
+    for _ in range(MACHINE_SWEEPS):
+        k = 0
+        while k < len(values):
+            normal = int(values[k, NORMAL_ROW])
+            if normal < 0:
+                impulse = _calc_row_impulse(machine, velocity, k)
+                _set_row_impulse(machine, velocity, k, min(max(impulse, values[k, LOWER]), values[k, UPPER]))
+                k += 1
+            else:
+                one = _calc_row_impulse(machine, velocity, k)
+                two = _calc_row_impulse(machine, velocity, k + 1)
+                limit = values[k, UPPER] * values[normal, ROW_IMPULSE]
+                size = math.sqrt(one * one + two * two)
+                if size > limit:
+                    one *= limit / size
+                    two *= limit / size
+                _set_row_impulse(machine, velocity, k, one)
+                _set_row_impulse(machine, velocity, k + 1, two)
+                k += 2
+
+
+@kernel
+def apply_impulses(
+    rows: Array,
+    n_rows: int,
+    body_a: Array,
+    body_b: Array,
+    bodies: Array,
+    n_rocks: int,
+    machine: MachineArrays,
+    velocity: Array,
+) -> None:
     """Apply the impulses that the rows hold (the warm start) to all bodies."""
     point = np.zeros(6)
     for k in range(n_rows):
@@ -495,7 +547,7 @@ def apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, veloc
 
 
 @kernel
-def _calc_impulse(row):
+def _calc_impulse(row: Array) -> Vector:
     """Return a row's impulse in W."""
     normal, one, two = row[IMPULSE], row[IMPULSE + 1], row[IMPULSE + 2]
     return (
@@ -506,7 +558,7 @@ def _calc_impulse(row):
 
 
 @kernel
-def _pack(rows, n_rows, body_a, body_b, packed, index):
+def _pack(rows: Array, n_rows: int, body_a: Array, body_b: Array, packed: Array, index: Array) -> None:
     """Copy rows to single precision, in `STREAMS` interleaved streams.
 
     Neighbours in the order then seldom share a body, and the processor works on several at a time. `index` is set
@@ -527,8 +579,19 @@ def _pack(rows, n_rows, body_a, body_b, packed, index):
 
 @kernel
 def solve_resting(
-    rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity, iterations, packed, index, bodies_32
-):
+    rows: Array,
+    n_rows: int,
+    body_a: Array,
+    body_b: Array,
+    bodies: Array,
+    n_rocks: int,
+    machine: MachineArrays,
+    velocity: Array,
+    iterations: int,
+    packed: Array,
+    index: Array,
+    bodies_32: Array,
+) -> float:
     """The resting stage: `iterations` symmetric sweeps, forwards and backwards in turn.
 
     The sweeps over the rocks run in single precision; the velocities are then made anew from the impulses in
@@ -585,9 +648,20 @@ def solve_resting(
 
 @kernel
 def solve_impacts(
-    rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity, time_step, threshold, iterations,
-    marks, impact_impulses,
-):  # fmt: skip
+    rows: Array,
+    n_rows: int,
+    body_a: Array,
+    body_b: Array,
+    bodies: Array,
+    n_rocks: int,
+    machine: MachineArrays,
+    velocity: Array,
+    time_step: float,
+    threshold: float,
+    iterations: int,
+    marks: Array,
+    impact_impulses: Array,
+) -> int:
     """The impact stage: Newton's law for pairs with restitution that meet faster than `threshold`.
 
     It covers all touching contacts of the bodies that take part. Pairs without restitution need no stage of

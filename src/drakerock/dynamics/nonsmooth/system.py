@@ -172,6 +172,7 @@ class NonsmoothRocks(LeafSystem):
             "penetration_p99": report.p99_penetration,
             "residual": report.residual,
             "n_lost": last[_N_LOST] + report.n_lost,
+            "n_flagged": last[_N_FLAGGED] + report.flagged,
         }
         summary = [float(values[name]) for name in ROCK_SUMMARY]
         for name, flat in _flatten(step.arrays, np.concatenate([summary, F_B_W])).items():
@@ -207,6 +208,7 @@ class NonsmoothRocks(LeafSystem):
 
 
 _N_LOST = list(ROCK_SUMMARY).index("n_lost")
+_N_FLAGGED = list(ROCK_SUMMARY).index("n_flagged")
 
 
 def _flatten(arrays: RockArrays, report: Array | None = None) -> dict[str, Array]:

@@ -170,7 +170,7 @@ class PlantRocks(LeafSystem):
         ]
         count = len(depths) + results.num_hydroelastic_contacts()
         depth_max, depth_99 = (max(depths), float(np.percentile(depths, 99))) if depths else (0.0, 0.0)
-        output.SetFromVector([len(self._free), count, depth_max, depth_99, 0.0, 0.0])
+        output.SetFromVector([len(self._free), count, depth_max, depth_99, 0.0, 0.0, 0.0])
 
     def _calc_bucket_force(self, context: Context, output: BasicVector) -> None:
         total = np.zeros(6)

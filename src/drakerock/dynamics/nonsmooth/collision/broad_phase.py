@@ -10,21 +10,31 @@ from __future__ import annotations
 import numpy as np
 
 from drakerock.dynamics.nonsmooth.collision.geometry import get_corner, get_rotation
-from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
+from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, kernel
 
 # How a rock is treated.
 AWAKE, RESTING, FIXED, LOST = 0, 1, 2, 3
 
 
 @kernel
-def _find_cell(value, origin, inverse_width, n_cells):
+def _find_cell(value: float, origin: float, inverse_width: float, n_cells: int) -> int:
     if not value > origin:
         return 0
     return min(int((value - origin) * inverse_width), n_cells - 1)
 
 
 @kernel
-def sort_into_grid(rocks, positions, origin, inverse_width, n_cells, cell_start, cells, items):
+def sort_into_grid(
+    rocks: Array,
+    positions: Array,
+    origin: Array,
+    inverse_width: float,
+    n_cells: Array,
+    cell_start: Array,
+    cells: Array,
+    items: Array,
+) -> None:
     """Sort rocks by grid cell (counting sort, stable).
 
     Args:
@@ -59,7 +69,7 @@ def sort_into_grid(rocks, positions, origin, inverse_width, n_cells, cell_start,
 
 
 @kernel
-def _boxes_meet(lower, upper, i, j):
+def _boxes_meet(lower: Array, upper: Array, i: int, j: int) -> bool:
     return (
         lower[i, 0] < upper[j, 0]
         and upper[i, 0] > lower[j, 0]
@@ -72,9 +82,21 @@ def _boxes_meet(lower, upper, i, j):
 
 @kernel
 def find_rock_pairs(
-    seekers, n_rocks, status, lower, upper, origin, inverse_width, n_cells, cell_start, items, reach,
-    pair_a, pair_b, n_pairs,
-):  # fmt: skip
+    seekers: Array,
+    n_rocks: int,
+    status: Array,
+    lower: Array,
+    upper: Array,
+    origin: Array,
+    inverse_width: float,
+    n_cells: Array,
+    cell_start: Array,
+    items: Array,
+    reach: float,
+    pair_a: Array,
+    pair_b: Array,
+    n_pairs: int,
+) -> int:
     """Add the pairs of seekers with the rocks of one grid.
 
     Args:
@@ -117,7 +139,17 @@ def find_rock_pairs(
 
 
 @kernel
-def find_static_pairs(awake, first_static, last_static, planes, lower, upper, pair_a, pair_b, n_pairs):
+def find_static_pairs(
+    awake: Array,
+    first_static: int,
+    last_static: int,
+    planes: Array,
+    lower: Array,
+    upper: Array,
+    pair_a: Array,
+    pair_b: Array,
+    n_pairs: int,
+) -> int:
     """Add the pairs of awake rocks with static pieces and planes.
 
     Args:
@@ -151,9 +183,21 @@ def find_static_pairs(awake, first_static, last_static, planes, lower, upper, pa
 
 @kernel
 def calc_poses(
-    geometry_shape, scale, quaternions, positions, velocities, sweep, margin, shapes, bodies,
-    rotations, lower, upper, inverse_inertia_local, inverse_inertia,
-):  # fmt: skip
+    geometry_shape: Array,
+    scale: Array,
+    quaternions: Array,
+    positions: Array,
+    velocities: Array,
+    sweep: float,
+    margin: float,
+    shapes: ConvexShapes,
+    bodies: Array,
+    rotations: Array,
+    lower: Array,
+    upper: Array,
+    inverse_inertia_local: Array,
+    inverse_inertia: Array,
+) -> None:
     """Set rotations, bounding boxes and world inertias of rocks.
 
     Args:
@@ -196,7 +240,7 @@ def calc_poses(
 
 
 @kernel
-def rotate_inertia(r, local, world, i):
+def rotate_inertia(r: Rotation, local: Array, world: Array, i: int) -> None:
     """Set ``world[i] = R local[i] R^T`` (symmetric: xx xy xz yy yz zz)."""
     xx, xy, xz, yy, yz, zz = local[i, 0], local[i, 1], local[i, 2], local[i, 3], local[i, 4], local[i, 5]
     m00, m01, m02 = r[0] * xx + r[1] * xy + r[2] * xz, r[0] * xy + r[1] * yy + r[2] * yz, r[0] * xz + r[1] * yz + r[2] * zz  # noqa: E501  # fmt: skip
@@ -212,8 +256,19 @@ def rotate_inertia(r, local, world, i):
 
 @kernel
 def calc_piece_boxes(
-    first, piece_body, shape, shapes, X_WBs, V_WBs, sweep, margin, positions, rotations, lower, upper
-):
+    first: int,
+    piece_body: Array,
+    shape: Array,
+    shapes: ConvexShapes,
+    X_WBs: Array,
+    V_WBs: Array,
+    sweep: float,
+    margin: float,
+    positions: Array,
+    rotations: Array,
+    lower: Array,
+    upper: Array,
+) -> None:
     """Set poses and bounding boxes of the machine's pieces; a box covers the way of every corner over a step.
 
     Args:

@@ -6,11 +6,12 @@ import math
 
 import numpy as np
 
-from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
+from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, Vector, kernel
 
 
 @kernel
-def get_rotation(rotations, k):
+def get_rotation(rotations: Array, k: int) -> Rotation:
     """Return rotation `k` of (n, 3, 3) as 9 numbers by rows."""
     return (
         rotations[k, 0, 0],
@@ -26,19 +27,19 @@ def get_rotation(rotations, k):
 
 
 @kernel
-def rotate(r, x, y, z):
+def rotate(r: Rotation, x: float, y: float, z: float) -> Vector:
     """Return R (x, y, z)."""
     return r[0] * x + r[1] * y + r[2] * z, r[3] * x + r[4] * y + r[5] * z, r[6] * x + r[7] * y + r[8] * z
 
 
 @kernel
-def rotate_back(r, x, y, z):
+def rotate_back(r: Rotation, x: float, y: float, z: float) -> Vector:
     """Return R^T (x, y, z)."""
     return r[0] * x + r[3] * y + r[6] * z, r[1] * x + r[4] * y + r[7] * z, r[2] * x + r[5] * y + r[8] * z
 
 
 @kernel
-def make_tangents(nx, ny, nz):
+def make_tangents(nx: float, ny: float, nz: float) -> tuple[float, float, float, float, float, float]:
     """Return two unit vectors that complete the unit vector (nx, ny, nz) to a right-handed frame."""
     if abs(nx) > 0.57:
         scale = 1.0 / math.sqrt(nx * nx + ny * ny)
@@ -50,7 +51,7 @@ def make_tangents(nx, ny, nz):
 
 
 @kernel
-def find_support(vertices, first, last, x, y, z):
+def find_support(vertices: Array, first: int, last: int, x: float, y: float, z: float) -> tuple[int, float]:
     """Return the corner among ``vertices[first:last]`` farthest along (x, y, z), and how far it is."""
     best = -np.inf
     index = first
@@ -63,7 +64,9 @@ def find_support(vertices, first, last, x, y, z):
 
 
 @kernel
-def calc_support_distance(shapes, shape, scale, r, x, y, z):
+def calc_support_distance(
+    shapes: ConvexShapes, shape: int, scale: float, r: Rotation, x: float, y: float, z: float
+) -> float:
     """Return how far a core reaches along (x, y, z) (in W), measured from its frame's origin."""
     lx, ly, lz = rotate_back(r, x, y, z)
     _, reach = find_support(
@@ -73,7 +76,7 @@ def calc_support_distance(shapes, shape, scale, r, x, y, z):
 
 
 @kernel
-def get_corner(shapes, corner, scale, r):
+def get_corner(shapes: ConvexShapes, corner: int, scale: float, r: Rotation) -> Vector:
     """Return a corner of a core in W's axes, from the frame's origin."""
     return rotate(
         r,

@@ -11,20 +11,23 @@ import math
 import numpy as np
 
 from drakerock.dynamics.nonsmooth.collision.geometry import find_support, get_corner, rotate_back
-from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
+from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, Vector, kernel
 
 SEPARATED, NEAR, OVERLAPPING = 1, 0, -1
 MAX_ITERATIONS = 32
 
 
 @kernel
-def make_gjk_workspace():
+def make_gjk_workspace() -> tuple[Array, Array, Array]:
     """Return (points, on_a, weights): the simplex of the difference, its points on A, barycentric weights."""
     return np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(4)
 
 
 @kernel
-def calc_triangle_weights(ax, ay, az, bx, by, bz, cx, cy, cz):
+def calc_triangle_weights(
+    ax: float, ay: float, az: float, bx: float, by: float, bz: float, cx: float, cy: float, cz: float
+) -> Vector:
     """Return the barycentric weights of the point of triangle abc nearest to the origin."""
     ux, uy, uz = bx - ax, by - ay, bz - az
     vx, vy, vz = cx - ax, cy - ay, cz - az
@@ -57,7 +60,7 @@ def calc_triangle_weights(ax, ay, az, bx, by, bz, cx, cy, cz):
 
 
 @kernel
-def _calc_weights(points, n_points, weights):
+def _calc_weights(points: Array, n_points: int, weights: Array) -> bool:
     """Set the weights of the point of the simplex nearest to the origin; True if the origin is inside."""
     if n_points == 1:
         weights[0] = 1.0
@@ -117,8 +120,22 @@ def _calc_weights(points, n_points, weights):
 
 @kernel
 def calc_core_distance(
-    shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, gx, gy, gz, max_distance, workspace
-):
+    shapes: ConvexShapes,
+    shape_a: int,
+    scale_a: float,
+    r_a: Rotation,
+    shape_b: int,
+    scale_b: float,
+    r_b: Rotation,
+    px: float,
+    py: float,
+    pz: float,
+    gx: float,
+    gy: float,
+    gz: float,
+    max_distance: float,
+    workspace: tuple[Array, Array, Array],
+) -> tuple[int, float, float, float, float, float, float]:
     """Find the nearest points of two cores.
 
     Args:

@@ -10,20 +10,23 @@ from __future__ import annotations
 import numpy as np
 
 from drakerock.dynamics.nonsmooth.collision.geometry import get_corner, rotate, rotate_back
-from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
+from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, kernel
 
 MAX_OUTLINE = 96
 MAX_POINTS = 4
 
 
 @kernel
-def make_manifold_workspace():
+def make_manifold_workspace() -> tuple[Array, Array, Array]:
     """Return (outline, clipped, candidates): two outlines (MAX_OUTLINE, 3) and points with gaps (.., 4)."""
     return np.zeros((MAX_OUTLINE, 3)), np.zeros((MAX_OUTLINE, 3)), np.zeros((MAX_OUTLINE, 4))
 
 
 @kernel
-def _find_face(shapes, shape, r, x, y, z):
+def _find_face(
+    shapes: ConvexShapes, shape: int, r: Rotation, x: float, y: float, z: float
+) -> tuple[int, float]:
     """Return the face of a core whose normal is nearest to (x, y, z) in W, and the cosine between them."""
     lx, ly, lz = rotate_back(r, x, y, z)
     best = -2.0
@@ -38,7 +41,17 @@ def _find_face(shapes, shape, r, x, y, z):
 
 
 @kernel
-def _clip(outline, n_points, clipped, px, py, pz, nx, ny, nz):
+def _clip(
+    outline: Array,
+    n_points: int,
+    clipped: Array,
+    px: float,
+    py: float,
+    pz: float,
+    nx: float,
+    ny: float,
+    nz: float,
+) -> int:
     """Cut away the part of an outline outside the plane through p with outward normal n; return the length."""
     n_kept = 0
     for k in range(n_points):
@@ -65,7 +78,9 @@ def _clip(outline, n_points, clipped, px, py, pz, nx, ny, nz):
 
 
 @kernel
-def add_spread_points(candidates, n_candidates, points, n_points, min_distance):
+def add_spread_points(
+    candidates: Array, n_candidates: int, points: Array, n_points: int, min_distance: float
+) -> int:
     """Add to the manifold `points` (4, 4) those candidates that are farthest from the points it has.
 
     Returns the number of points.
@@ -93,9 +108,24 @@ def add_spread_points(candidates, n_candidates, points, n_points, min_distance):
 
 @kernel
 def make_manifold(
-    shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, nx, ny, nz,
-    max_gap, min_cosine, points, workspace,
-):  # fmt: skip
+    shapes: ConvexShapes,
+    shape_a: int,
+    scale_a: float,
+    r_a: Rotation,
+    shape_b: int,
+    scale_b: float,
+    r_b: Rotation,
+    px: float,
+    py: float,
+    pz: float,
+    nx: float,
+    ny: float,
+    nz: float,
+    max_gap: float,
+    min_cosine: float,
+    points: Array,
+    workspace: tuple[Array, Array, Array],
+) -> int:
     """Extend the nearest point of a pair to a manifold of at most four points.
 
     Args:

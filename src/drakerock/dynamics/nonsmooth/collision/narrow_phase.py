@@ -26,7 +26,8 @@ from drakerock.dynamics.nonsmooth.collision.manifold import (
     make_manifold_workspace,
 )
 from drakerock.dynamics.nonsmooth.collision.overlap import calc_core_penetration
-from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
+from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, kernel
 from drakerock.dynamics.nonsmooth.contacts import (
     ARM_A,
     ARM_B,
@@ -52,7 +53,19 @@ FAST = 0.03
 
 
 @kernel
-def _find_plane_points(shapes, shape, scale, r, x, y, z, plane, max_gap, points, candidates):
+def _find_plane_points(
+    shapes: ConvexShapes,
+    shape: int,
+    scale: float,
+    r: Rotation,
+    x: float,
+    y: float,
+    z: float,
+    plane: Array,
+    max_gap: float,
+    points: Array,
+    candidates: Array,
+) -> int:
     """Set the manifold of a rock on a plane: its corners within `max_gap`, the deepest first, then spread."""
     rounding = scale * shapes.rounding[shape]
     height = plane[0] * x + plane[1] * y + plane[2] * z - plane[3] - rounding
@@ -80,7 +93,20 @@ def _find_plane_points(shapes, shape, scale, r, x, y, z, plane, max_gap, points,
 
 
 @kernel
-def _add_fast_points(shapes, shape, scale, r, nx, ny, nz, offset, max_gap, points, n_points, candidates):
+def _add_fast_points(
+    shapes: ConvexShapes,
+    shape: int,
+    scale: float,
+    r: Rotation,
+    nx: float,
+    ny: float,
+    nz: float,
+    offset: float,
+    max_gap: float,
+    points: Array,
+    n_points: int,
+    candidates: Array,
+) -> int:
     """Add the corners of a fast rock that can reach the plane ``n p = offset`` of what it is about to hit.
 
     A rock that strikes with one corner would be spun through a thin plate within the step; with rows for its
@@ -103,11 +129,37 @@ def _add_fast_points(shapes, shape, scale, r, nx, ny, nz, offset, max_gap, point
 
 @kernel
 def find_contacts(
-    pair_a, pair_b, n_pairs, n_rocks, first_plane, first_piece, planes, shapes, shape, scale,
-    positions, rotations, velocities, solver_body, friction, restitution,
-    time_step, margin, manifold_gap, face_cosine,
-    memory, table, axis_keys, axes, rows, body_a, body_b, row_key, row_rock, statistics,
-):  # fmt: skip
+    pair_a: Array,
+    pair_b: Array,
+    n_pairs: int,
+    n_rocks: int,
+    first_plane: int,
+    first_piece: int,
+    planes: Array,
+    shapes: ConvexShapes,
+    shape: Array,
+    scale: Array,
+    positions: Array,
+    rotations: Array,
+    velocities: Array,
+    solver_body: Array,
+    friction: Array,
+    restitution: Array,
+    time_step: float,
+    margin: float,
+    manifold_gap: float,
+    face_cosine: float,
+    memory: Array,
+    table: Array,
+    axis_keys: Array,
+    axes: Array,
+    rows: Array,
+    body_a: Array,
+    body_b: Array,
+    row_key: Array,
+    row_rock: Array,
+    statistics: Array,
+) -> int:
     """Find the contact points of all pairs.
 
     Bodies are numbered rocks, static pieces, planes, pieces of the machine. `solver_body` maps them to the

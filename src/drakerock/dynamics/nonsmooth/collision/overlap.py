@@ -18,13 +18,27 @@ from drakerock.dynamics.nonsmooth.collision.geometry import (
     rotate,
     rotate_back,
 )
-from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
+from drakerock.dynamics.nonsmooth.compiling import Rotation, kernel
 
 
 @kernel
 def calc_core_penetration(
-    shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, hx, hy, hz, min_cosine
-):
+    shapes: ConvexShapes,
+    shape_a: int,
+    scale_a: float,
+    r_a: Rotation,
+    shape_b: int,
+    scale_b: float,
+    r_b: Rotation,
+    px: float,
+    py: float,
+    pz: float,
+    hx: float,
+    hy: float,
+    hz: float,
+    min_cosine: float,
+) -> tuple[float, float, float, float, float, float, float]:
     """Find the direction of least penetration of two cores.
 
     Args:

@@ -1,0 +1,136 @@
+"""The nonsmooth engine against the plant engine: the same machine digs the same small piles.
+
+    python benchmarks/compare_engines.py --rocks 300 --seeds 4 --out build/engines.jsonl
+
+Each seed is one pile, filled and at rest in the nonsmooth engine, relaxed for a second in each engine with the
+machine standing, then dug with the same motor targets. Finished runs are skipped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from faithfulness import SIZES, make_small_pile
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from rocks import ROCKS, SHAPES, TIME_STEP, Motors, clear_way, make_dig
+from scipy import stats
+
+from drakerock.dynamics.assembly import add_plant, add_site
+from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
+from drakerock.dynamics.nonsmooth.system import add_nonsmooth_rocks
+from drakerock.dynamics.plant.rocks import add_plant_rocks, add_rock_bodies
+from drakerock.machine.config import MachineConfig
+from drakerock.machine.model import add_machine, calc_motor_targets
+from drakerock.machine.placement import set_machine_pose
+from drakerock.pile.config import SiteConfig
+from drakerock.pile.site import make_site
+from drakerock.pile.state import PileState
+
+METRICS = ("bucket_mass_kg", "peak_push_kN", "mean_push_kN", "displaced_m3", "reach_m")
+RELAXING = 1.0
+
+
+def run(pile: PileState, engine: str, site: SiteConfig, depth: float, duration: float) -> dict[str, float]:
+    dynamics = DynamicsConfig(rocks=engine, nonsmooth=NonsmoothConfig(reduction="none"), time_step=TIME_STEP)
+    builder = DiagramBuilder()
+    plant, scene_graph = add_plant(builder, dynamics)
+    built = make_site(site)
+    add_site(plant, built, dynamics)
+    machine = add_machine(plant, MachineConfig())
+    inputs = []
+    if engine == "plant":
+        geometries = add_rock_bodies(plant, pile, SHAPES, ROCKS, dynamics)
+        plant.Finalize()
+        rocks = add_plant_rocks(builder, plant, pile, geometries)
+    else:
+        plant.Finalize()
+        rocks, view = add_nonsmooth_rocks(
+            builder, plant, scene_graph, machine, built, SHAPES, ROCKS, dynamics, pile
+        )
+        inputs.append(view.GetInputPort("desired_state"))
+    inputs.append(plant.get_desired_state_input_port(machine.instance))
+    rates = make_dig(depth)
+
+    def delayed(t: float) -> np.ndarray:
+        wanted = rates(t - RELAXING) if t > RELAXING else (0.0, 0.0, 0.0)
+        return calc_motor_targets(plant, machine, *wanted)
+
+    motors = builder.AddSystem(Motors(delayed, len(delayed(0.0))))
+    for port in inputs:
+        builder.Connect(motors.GetOutputPort("desired_state"), port)
+    simulator = Simulator(builder.Build())
+    root = simulator.get_mutable_context()
+    rocks.set_pile(root, pile)
+    context = rocks.GetMyContextFromRoot(root)
+    plant_context = plant.GetMyMutableContextFromRoot(root)
+    set_machine_pose(plant, plant_context, machine, x_tip=float(pile.p_WRs[:, 0].min()) - 0.7, z_tip=0.02)
+    simulator.Initialize()
+    tip, bucket = plant.GetFrameByName("tip"), plant.GetBodyByName("bucket")
+    start = tip.CalcPoseInWorld(plant_context).translation()[0]
+    n = round(duration / TIME_STEP)
+    push, reach = np.zeros(n), np.zeros(n)
+    simulator.AdvanceTo(RELAXING)
+    before = rocks.get_pile(root).p_WRs
+    cpu = time.process_time()
+    for k in range(n):
+        simulator.AdvanceTo(RELAXING + (k + 1) * TIME_STEP)
+        push[k] = -rocks.GetOutputPort("F_B_W").Eval(context)[3]
+        reach[k] = tip.CalcPoseInWorld(plant_context).translation()[0] - start
+    cpu = time.process_time() - cpu
+    after = rocks.get_pile(root).p_WRs
+    X_WB = plant.EvalBodyPoseInWorld(plant_context, bucket)
+    local = (after - X_WB.translation()) @ X_WB.rotation().matrix()
+    inside = (np.abs(local - [0.95, 0.0, 0.9]) < [1.15, 1.5, 1.4]).all(axis=1)
+    masses = pile.calc_masses(np.array([shape.volume for shape in SHAPES]), ROCKS.density)
+    smooth = np.convolve(push, np.full(10, 0.1), mode="valid")
+    return {
+        "bucket_mass_kg": float(masses[inside].sum()),
+        "peak_push_kN": float(smooth.max()) / 1e3,
+        "mean_push_kN": float(push[:600].clip(0.0).mean()) / 1e3,
+        "displaced_m3": float(masses[np.linalg.norm(after - before, axis=1) > 0.05].sum() / ROCKS.density),
+        "reach_m": float(reach.max()),
+        "cpu_s": cpu,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rocks", type=int, default=300)
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--duration", type=float, default=10.0)
+    parser.add_argument("--out", type=Path, default=Path("build/engines.jsonl"))
+    arguments = parser.parse_args()
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
+    results = {(r["seed"], r["engine"]): r for r in map(json.loads, lines)}
+    site = SIZES["300"][1]
+    for seed in range(arguments.seeds):
+        if all((seed, engine) in results for engine in ("plant", "nonsmooth")):
+            continue
+        pile = clear_way(make_small_pile(arguments.rocks, site, 6.0, seed))
+        pile = replace(pile, V_WRs=np.zeros((len(pile), 6)))
+        depth = np.random.default_rng(seed).uniform(0.6, 1.4)
+        for engine in ("nonsmooth", "plant"):
+            result = run(pile, engine, site, depth, arguments.duration)
+            results[seed, engine] = result
+            with open(arguments.out, "a", encoding="utf-8") as file:
+                file.write(json.dumps({"seed": seed, "engine": engine, "rocks": len(pile), **result}) + "\n")
+            print(seed, engine, len(pile), {k: round(v, 2) for k, v in result.items()}, flush=True)
+    for metric in (*METRICS, "cpu_s"):
+        a, b = (
+            np.array([results[s, engine][metric] for s in range(arguments.seeds)])
+            for engine in ("nonsmooth", "plant")
+        )
+        half = stats.t.ppf(0.95, len(a) - 1) * (a - b).std(ddof=1) / np.sqrt(len(a)) if len(a) > 1 else np.nan
+        text = f"{metric}: nonsmooth {a.mean():.4g}, plant {b.mean():.4g}, difference {(a - b).mean():.3g}"
+        print(f"{text} ± {half:.3g}")
+
+
+if __name__ == "__main__":
+    main()

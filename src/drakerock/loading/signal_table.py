@@ -1,0 +1,44 @@
+"""The file of a cycle's signals: Parquet, with units."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from drakerock.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+def save_signals(columns: dict[str, Array], units: dict[str, str], path: str | Path) -> None:
+    """Write the columns as Parquet; each column's unit is in its field's metadata under ``unit``.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    schema = pa.schema([pa.field(name, pa.float64(), metadata={"unit": units[name]}) for name in columns])
+    table = pa.table([pa.array(column) for column in columns.values()], schema=schema)
+    try:
+        pq.write_table(table, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error}") from None
+
+
+def load_signals(path: str | Path) -> tuple[dict[str, Array], dict[str, str]]:
+    """Read what `save_signals` wrote: the columns (k,), and their units.
+
+    Raises:
+        InputError: missing or not a file of signals.
+    """
+    try:
+        table = pq.read_table(path)
+        units = {field.name: field.metadata[b"unit"].decode() for field in table.schema}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, pa.ArrowException, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not a readable file of signals: {error}") from None
+    return {name: table[name].to_numpy() for name in table.column_names}, units

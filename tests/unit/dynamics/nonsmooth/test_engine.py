@@ -1,0 +1,331 @@
+"""Broad phase, contact memory, solver, reduction and failures of the nonsmooth engine, each alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydrake.solvers import ClarabelSolver, MathematicalProgram
+from pydrake.systems.analysis import Simulator
+from scipy.spatial.transform import Rotation
+
+from drakerock.dynamics.config import NonsmoothConfig, RestConfig
+from drakerock.dynamics.interface import ROCK_SUMMARY
+from drakerock.dynamics.nonsmooth import contacts, motion, reduction
+from drakerock.dynamics.nonsmooth.engine import make_machineless_step
+from drakerock.dynamics.nonsmooth.system import NonsmoothRocks
+from drakerock.errors import InputError, SimulationFailure
+from drakerock.pile.config import RocksConfig
+from drakerock.pile.shapes import load_rock_shapes
+from drakerock.pile.state import load_pile, save_pile
+from rock_helpers import draw_quaternion, make_ball, make_box, make_engine, make_pile, make_plane_site, run
+
+SHAPES = load_rock_shapes(RocksConfig().shapes)
+
+
+def draw_pile(seed, n, box=2.0, sizes=(0.3, 0.4, 0.6, 0.8)):
+    rng = np.random.default_rng(seed)
+    return make_pile(
+        rng.uniform([-box, -box, 0.3], [box, box, box], (n, 3)),
+        shape=rng.integers(0, 6, n),
+        size=rng.choice(sizes, n),
+        quaternions=[draw_quaternion(rng) for _ in range(n)],
+        velocities=rng.normal(size=(n, 6)),
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_broad_phase_finds_every_pair_of_boxes_that_meet(seed):
+    pile = draw_pile(seed, 120)
+    engine = make_engine(pile, SHAPES, make_plane_site(planes=5))
+    arrays = engine.make_arrays(pile)
+    rng = np.random.default_rng(seed)
+    arrays.book[rng.random(len(pile)) < 0.4, reduction.STATUS] = 1  # some at rest
+    status = arrays.book[:, reduction.STATUS].astype(np.int64)
+    awake = np.flatnonzero(status == 0)
+    engine._pose(arrays, make_machineless_step(), awake)
+    n_pairs = engine._find_pairs(status, awake)
+    found = [
+        (int(a), int(b)) for a, b in zip(engine._pair_a[:n_pairs], engine._pair_b[:n_pairs], strict=True)
+    ]
+    assert len(found) == len(set(found))
+    lower, upper = engine._lower, engine._upper
+    expected = {
+        (i, j)
+        for i in range(len(pile))
+        for j in range(i + 1, len(pile))
+        if (lower[i] < upper[j]).all() and (upper[i] > lower[j]).all() and (status[i] == 0 or status[j] == 0)
+    }
+    assert {pair for pair in found if pair[1] < len(pile)} == expected
+    # the boxes hold the rocks
+    for i in range(len(pile)):
+        r = Rotation.from_quat(arrays.quaternions[i], scalar_first=True)
+        corners = r.apply(SHAPES[pile.shape[i]].vertices * pile.size[i]) + pile.p_WRs[i]
+        assert (corners > lower[i] - 0.01 * pile.size[i]).all()
+        assert (corners < upper[i] + 0.01 * pile.size[i]).all()
+
+
+def test_frictionless_contacts_agree_with_a_quadratic_program():
+    """Normal impulses of a cluster of balls between walls: least kinetic energy under the gaps' constraints."""
+    rng = np.random.default_rng(0)
+    n = 12
+    pile = make_pile(
+        rng.uniform([-0.6, -0.6, 0.5], [0.6, 0.6, 1.6], (n, 3)) * 1.0,
+        size=rng.uniform(0.4, 0.6, n),
+        velocities=np.hstack([np.zeros((n, 3)), rng.normal(size=(n, 3))]),
+    )
+    # stiff, undamped by design: iterations to convergence
+    engine = make_engine(
+        pile, [make_ball()], make_plane_site(1e-9), RocksConfig(friction=1e-9),
+        NonsmoothConfig(reduction="none", iterations=2000, max_residual=1e9, impact_threshold=1e-9),
+    )  # fmt: skip
+    arrays = engine.make_arrays(pile)
+    new, report = engine.step(arrays, make_machineless_step())
+    assert report.n_loaded >= 4
+    rows = engine._rows[: report.n_contacts]
+    normals, gaps = rows[:, contacts.NORMAL : contacts.NORMAL + 3], rows[:, contacts.GAP]
+    # v minimises 1/2 (v - v_free)^T M (v - v_free) with G v >= bias, translations and rotations
+    program = MathematicalProgram()
+    v = program.NewContinuousVariables(6 * n)
+    mass = np.zeros((6 * n, 6 * n))
+    free = pile.V_WRs.copy()
+    free[:, 5] -= 9.81 * engine.time_step
+    for i in range(n):
+        inverse = engine._inverse_inertia[i]
+        inertia = np.linalg.inv(
+            [
+                [inverse[0], inverse[1], inverse[2]],
+                [inverse[1], inverse[3], inverse[4]],
+                [inverse[2], inverse[4], inverse[5]],
+            ]
+        )
+        mass[6 * i : 6 * i + 3, 6 * i : 6 * i + 3] = inertia
+        mass[6 * i + 3 : 6 * i + 6, 6 * i + 3 : 6 * i + 6] = engine.mass[i] * np.eye(3)
+    program.AddQuadraticCost(mass, -mass @ free.reshape(-1), v, is_convex=True)
+    for k in range(len(rows)):
+        g = np.zeros(6 * n)
+        a, b = engine._body_a[k], engine._body_b[k]
+        g[6 * a : 6 * a + 6] = -np.concatenate([np.cross(rows[k, 9:12], normals[k]), normals[k]])
+        if b < n:
+            g[6 * b : 6 * b + 6] += np.concatenate([np.cross(rows[k, 12:15], normals[k]), normals[k]])
+        program.AddLinearConstraint(g[None], [rows[k, contacts.BIAS]], [np.inf], v)
+        assert gaps[k] > 0 or rows[k, contacts.COMPLIANCE] < 1e-3
+    expected = ClarabelSolver().Solve(program).GetSolution(v).reshape(n, 6)
+    np.testing.assert_allclose(new.velocities[:, 3:], expected[:, 3:], atol=5e-3)
+
+
+def test_contact_memory_is_found_again():
+    """A box at rest: the second step starts from the first one's impulses."""
+    pile = make_pile([[0, 0, 0.25]])
+    engine = make_engine(pile, [make_box(0.8, 0.6, 0.5)])
+    arrays, _ = run(engine, engine.make_arrays(pile), 0.5)
+    assert arrays.n_memory == 4
+    sums = np.zeros((1, 3))
+    contacts.sum_impulses(arrays.memory, arrays.n_memory, 1, sums)
+    np.testing.assert_allclose(sums[0], [0, 0, engine.mass[0] * 9.81 * 0.01], rtol=1e-4, atol=1e-6)
+    table = np.zeros(64, np.int64)
+    contacts.index_memory(arrays.memory, arrays.n_memory, table)
+    key = int(arrays.memory[0, contacts.MEMORY_KEY])
+    assert contacts.find_in_memory(key, arrays.memory, table) == 0
+    assert contacts.find_in_memory(key + 1, arrays.memory, table) == -1
+
+
+def settle(n=25, seed=0):
+    rng = np.random.default_rng(seed)
+    pile = make_pile(
+        rng.uniform([-0.5, -0.5, 0.3], [0.5, 0.5, 4.0], (n, 3)),
+        shape=rng.integers(0, 6, n),
+        size=rng.choice([0.3, 0.4], n),
+        quaternions=[draw_quaternion(rng) for _ in range(n)],
+    )
+    engine = make_engine(pile, SHAPES, config=NonsmoothConfig(), site=make_plane_site(planes=5))
+    arrays, _ = run(engine, engine.make_arrays(pile), 4.0)
+    return engine, arrays
+
+
+def test_a_stored_pile_starts_warm(tmp_path):
+    engine, arrays = settle()
+    pile = engine.make_pile(arrays)
+    save_pile(pile, tmp_path / "pile.npz")
+    loaded = load_pile(tmp_path / "pile.npz")
+    again = engine.make_arrays(loaded)
+    for name in ("positions", "quaternions", "velocities"):
+        assert np.array_equal(getattr(arrays, name), getattr(again, name))
+    assert again.n_memory == arrays.n_memory
+    assert np.array_equal(again.memory[: again.n_memory], arrays.memory[: arrays.n_memory])
+    # all awake, it stays where it is; without the contacts it sinks and jumps more
+    moved = {}
+    for name, start in (("warm", loaded), ("cold", replace(loaded, contacts=None))):
+        config = NonsmoothConfig(reduction="none", iterations=3, max_residual=1e9)
+        awake = make_engine(start, SHAPES, make_plane_site(planes=5), config=config)
+        one, _ = awake.advance(awake.make_arrays(start))
+        moved[name] = np.abs(one.velocities[:, 3:]).max()
+    assert moved["warm"] < 0.5 * moved["cold"]
+
+
+def test_contacts_follow_the_rocks_they_belong_to():
+    engine, arrays = settle()
+    pile = engine.make_pile(arrays)
+    order = np.arange(5, len(pile))
+    part = pile.select(order)
+    kept = (pile.contacts.pairs[:, 0] >= 5) & (
+        (pile.contacts.pairs[:, 1] >= 5) | (pile.contacts.pairs[:, 1] < 0)
+    )
+    assert len(part.contacts.pairs) == kept.sum()
+    both = part.join(pile.select(np.arange(5)))
+    assert len(both) == len(pile)
+    assert both.contacts.pairs.max() < len(pile)
+    np.testing.assert_allclose(both.contacts.impulses[: kept.sum()], pile.contacts.impulses[kept])
+    with pytest.raises(ValueError, match="not in the pile"):
+        replace(pile, contacts=replace(pile.contacts, pairs=pile.contacts.pairs + len(pile)))
+
+
+def test_rocks_rest_keep_their_forces_and_wake_when_their_load_changes():
+    engine, arrays = settle()
+    status = arrays.book[:, reduction.STATUS]
+    assert (status == 1).mean() > 0.8
+    before = arrays.memory[: arrays.n_memory].copy()
+    after, _ = run(engine, arrays, 0.2)
+    both_rest = [row for row in before if _rests(row, status, engine.n_rocks)]
+    kept = {tuple(row) for row in after.memory[: after.n_memory]}
+    assert all(tuple(row) in kept for row in both_rest)
+    # a heavy rock dropped on the heap wakes what it lands on
+    top = int(np.argmax(after.positions[:, 2]))
+    heavy = engine.place(
+        after, np.array([top]), after.positions[[top]] + [[0, 0, 1.0]], np.array([[0, 0, 0, 0, 0, -6.0]])
+    )
+    woken = 0
+    for _ in range(60):
+        heavy, report = engine.advance(heavy)
+        woken += report.n_woken
+    assert woken >= 2
+
+
+def _rests(row, status, n):
+    key = int(row[contacts.MEMORY_KEY])
+    a, b = key // contacts.KEY_STEP, key % contacts.KEY_STEP
+    return status[a] == 1 and (b >= n or status[b] == 1)
+
+
+def test_the_sensor_wakes_what_is_in_its_box():
+    engine, arrays = settle()
+    book = arrays.book.copy()
+    book[:, reduction.STATUS] = 1
+    sums = book[:, reduction.REFERENCE : reduction.REFERENCE + 3].copy()
+    box = np.concatenate([np.eye(3).reshape(-1), np.zeros(3), [-10, -10, -1], [0.0, 10, 10]])
+    n = reduction.wake(book, arrays.positions, engine.radius, engine.mass, sums, box[None], 0.1, 3)
+    inside = arrays.positions[:, 0] < engine.radius
+    assert n == inside.sum()
+    assert ((book[:, reduction.STATUS] == 0) == inside).all()
+
+
+def test_rocks_that_leave_the_site_are_counted_and_taken_out():
+    pile = make_pile([[0, 0, 0.25], [30.0, 0, 1.0]], velocities=[[0] * 6, [0, 0, 0, 2500.0, 0, 0]])
+    engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)])
+    arrays, report = engine.advance(engine.make_arrays(pile))
+    assert report.n_lost == 1
+    assert arrays.book[1, reduction.STATUS] == 3
+    assert not arrays.velocities[1].any()
+    _, report = engine.advance(arrays)
+    assert report.n_lost == 0
+    assert report.n_awake == 1
+
+
+def test_values_that_are_not_finite_do_not_leave_a_step():
+    pile = make_pile([[0, 0, 0.25]])
+    engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)])
+    arrays = engine.make_arrays(pile)
+    for group in (arrays.velocities, arrays.positions, arrays.quaternions):
+        before = group[0, 0]
+        group[0, 0] = np.nan
+        with pytest.raises(SimulationFailure, match="not finite"):
+            engine.advance(arrays)
+        group[0, 0] = before
+
+
+def test_a_step_that_does_not_converge_is_redone():
+    pile = make_pile([[0, 0, 0.25 + 0.5 * k] for k in range(20)])
+    config = NonsmoothConfig(reduction="none", iterations=1, max_residual=1e-3)
+    engine = make_engine(pile, [make_box(0.8, 0.8, 0.5)], config=config)
+    _, report = engine.advance(engine.make_arrays(pile))
+    assert report.redone
+    assert report.flagged
+
+
+def test_deep_overlap_recovers_slowly():
+    pile = make_pile([[0, 0, 5.0], [0.1, 0.05, 5.2]])
+    engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)], gravity=0.0)
+    arrays = engine.make_arrays(pile)
+    fastest = 0.0
+    arrays, report = engine.advance(arrays)
+    assert report.flagged
+    for _ in range(200):
+        arrays, report = engine.advance(arrays)
+        fastest = max(fastest, np.abs(arrays.velocities[:, 3:]).max())
+    assert fastest <= engine.config.max_recovery_speed
+    assert report.max_penetration < 1e-3
+    assert not report.flagged
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-3, 3), min_size=3, max_size=3), st.integers(0, 1000))
+def test_turning_is_the_exponential_map(vector, seed):
+    start = Rotation.random(random_state=seed)
+    q = start.as_quat(scalar_first=True)
+    turned = Rotation.from_quat(motion.turn(*q, *vector), scalar_first=True)
+    expected = Rotation.from_rotvec(vector) * start
+    assert (turned * expected.inv()).magnitude() < 1e-9
+
+
+def test_another_piles_rocks_are_refused():
+    pile = make_pile([[0, 0, 0.25]])
+    engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)])
+    with pytest.raises(ValueError, match="not those"):
+        engine.make_arrays(make_pile([[0, 0, 0.25]], size=[0.9]))
+
+
+def test_settings_are_checked():
+    with pytest.raises(ValueError, match="manifold_gap"):
+        NonsmoothConfig(manifold_gap=0.05)
+    with pytest.raises(ValueError, match="wake_load"):
+        RestConfig(wake_load=0.0)
+
+
+def test_a_damaged_pile_file_is_refused(tmp_path):
+    engine, arrays = settle(5)
+    path = tmp_path / "pile.npz"
+    save_pile(engine.make_pile(arrays), path)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(bytes(data))
+    with pytest.raises(InputError):
+        load_pile(path)
+
+
+def test_a_site_without_rocks_steps():
+    pile = make_pile(np.zeros((0, 3)), quaternions=np.zeros((0, 4)), velocities=np.zeros((0, 6)))
+    engine = make_engine(pile, SHAPES)
+    _, report = engine.advance(engine.make_arrays(pile))
+    assert report.n_awake == report.n_contacts == 0
+
+
+def test_the_system_runs_without_a_machine_and_steps_as_the_engine_does():
+    pile = draw_pile(0, 20)
+    engine = make_engine(pile, SHAPES, make_plane_site(planes=5))
+    system = NonsmoothRocks(engine, pile)
+    simulator = Simulator(system)
+    simulator.AdvanceTo(0.5)
+    expected, _ = run(engine, engine.make_arrays(pile), 0.5)
+    actual = system.get_pile(simulator.get_context())
+    assert np.array_equal(actual.p_WRs, expected.positions)
+    poses = system.GetOutputPort("rock_poses").Eval(simulator.get_context()).reshape(-1, 7)
+    assert np.array_equal(poses, np.hstack([expected.quaternions, expected.positions]))
+    velocities = system.GetOutputPort("rock_velocities").Eval(simulator.get_context())
+    assert np.array_equal(velocities.reshape(-1, 6), expected.velocities)
+    summary = system.GetOutputPort("rock_summary").Eval(simulator.get_context())
+    assert summary[list(ROCK_SUMMARY).index("n_awake")] == len(pile)
+    assert not system.GetOutputPort("F_B_W").Eval(simulator.get_context()).any()
+    assert not system.GetOutputPort("rock_status").Eval(simulator.get_context()).any()

@@ -1,0 +1,159 @@
+import json
+from dataclasses import replace
+
+import matplotlib.image
+import numpy as np
+import pytest
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+from drakerock.errors import InputError
+from drakerock.loading.field import calc_pile_profile
+from drakerock.loading.plan import NoPlan
+from drakerock.loading.plan_file import load_plan, save_plan
+from drakerock.loading.recording import Recording, Visual, save_recording
+from drakerock.loading.scenario import Scenario
+from drakerock.loading.signal_table import load_signals, save_signals
+from drakerock.pile.config import SiteConfig
+from drakerock.viewing.cycle_figures import (
+    calc_rock_poses,
+    draw_height_field,
+    draw_scene,
+    draw_tip_paths,
+    write_cycle_figures,
+)
+from tests.unit.loading.test_planning import make_wedge, plan_for
+
+COLUMNS = (
+    "x_T", "z_T", "bucket_force_x", "bucket_force_z", "hinge_moment", "torque_wheels", "torque_boom",
+    "torque_bucket", "v_F", "wheel_slip",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plan(digger):
+    return plan_for(digger, make_wedge(), beta=0.6, kappa=0.6)
+
+
+@pytest.fixture
+def recording(heap, shapes):
+    box = np.array([[x, y, z] for x in (0, 1) for y in (-1, 1) for z in (0, 1)], np.float32)
+    triangles = np.array([[0, 2, 6], [0, 6, 4], [1, 3, 7], [1, 7, 5]], np.int32)
+    poses = np.tile(np.array([1, 0, 0, 0, -6.0, 0, 0.5], np.float32), (5, 1, 1))
+    poses[:, 0, 4] += np.arange(5)
+    n = len(heap)
+    return Recording(
+        times=np.arange(5) * 2.0,
+        modes=np.arange(5),
+        bodies=("bucket",),
+        X_WBs=poses,
+        visuals=(Visual(0, box, triangles, np.array([0.9, 0.7, 0.1, 1.0], np.float32)),),
+        rock_shapes=tuple((shape.vertices, shape.triangles) for shape in shapes),
+        rock_shape=heap.shape,
+        rock_size=heap.size,
+        rock_fixed=heap.fixed,
+        X_WRs=np.hstack([heap.q_WRs, heap.p_WRs]),
+        move_frame=np.array([1, 2, 3], np.int32),
+        move_rock=np.array([4, n - 1, 4], np.int32),
+        move_pose=np.array([[1, 0, 0, 0, -3.0, k, 1.0] for k in range(3)], np.float32),
+        site=SiteConfig(drift_width=3.9),
+        notes={},
+    )
+
+
+@pytest.fixture
+def folder(tmp_path, plan, recording):
+    save_plan(plan, make_wedge(), tmp_path / "plan.json")
+    time = np.arange(0, 8, 0.01)
+    rng = np.random.default_rng(0)
+    signals = {"time": time, "mode": np.minimum(time // 1.5, 5)} | {
+        k: rng.normal(size=len(time)) for k in COLUMNS
+    }
+    save_signals(signals, dict.fromkeys(signals, "1"), tmp_path / "signals.parquet")
+    save_recording(recording, tmp_path / "recording.npz")
+    outcome = {"waypoint_times_s": [1.5, 3.0, 3.0, 6.0, 7.5]}
+    (tmp_path / "outcome.json").write_text(json.dumps(outcome))
+    (tmp_path / "scenario.json").write_text(Scenario().model_dump_json())
+    return tmp_path
+
+
+def test_rocks_are_where_they_were_last_seen(recording, heap):
+    last = len(heap) - 1
+    assert np.array_equal(calc_rock_poses(recording, 0), recording.X_WRs)
+    assert calc_rock_poses(recording, 1)[4, 5] == 0.0
+    assert calc_rock_poses(recording, 2)[last, 5] == 1.0
+    assert calc_rock_poses(recording, 2)[4, 5] == 0.0
+    assert calc_rock_poses(recording, 4)[4, 5] == 2.0
+
+
+def count_polygons(recording, view, **options):
+    ax = Figure().subplots()
+    draw_scene(ax, recording, 0, view, **options)
+    (collection,) = [item for item in ax.collections if isinstance(item, PolyCollection)]
+    return len(collection.get_paths())
+
+
+def test_side_view_is_cut_open_and_top_view_is_whole(recording, heap):
+    behind = int(np.sum(heap.p_WRs[:, 1] >= 0.1))
+    assert 0 < behind < len(heap)
+    assert count_polygons(recording, "side", y_cut=0.1, machine=False) == behind
+    assert count_polygons(recording, "top", machine=False) == len(heap)
+    # Seen from above, the box's two faces are four triangles with one outline.
+    assert count_polygons(recording, "top") == len(heap) + 4 + 1
+
+
+def test_curves_and_entry_point_are_drawn_where_they_are(plan):
+    field = make_wedge()
+    profile = calc_pile_profile(field, 0.15)
+    ax = draw_height_field(Figure().subplots(), field, profile, plan)
+    lines = {line.get_label(): line for line in ax.lines}
+    assert np.array_equal(lines["front $x_f$"].get_xdata(), profile.x_front)
+    assert np.array_equal(lines["centre of mass $x_m$"].get_xdata(), profile.x_mass)
+    assert lines["entry point"].get_xdata()[0] == plan.waypoint_x[0]
+    assert lines["entry point"].get_ydata()[0] == plan.y
+
+
+def test_actual_path_is_that_from_s0_to_s4(plan):
+    signals = {"mode": np.array([0, 1, 2, 5]), "x_T": np.arange(4.0), "z_T": np.arange(4.0)}
+    ax = draw_tip_paths(Figure().subplots(), plan, signals)
+    lines = {line.get_label(): line for line in ax.lines}
+    assert list(lines["actual"].get_xdata()) == [1.0, 2.0]
+    assert np.array_equal(lines["planned"].get_xdata(), plan.x)
+
+
+def test_all_pictures_of_a_stored_cycle(folder):
+    paths = write_cycle_figures(folder)
+    names = {path.stem.removeprefix("figure_") for path in paths}
+    assert names == {"height_field", "plan", "tip_path", "histories", "side", "top"}
+    for path in paths:
+        picture = matplotlib.image.imread(path)[..., :3].mean(axis=2)
+        assert min(picture.shape) > 400
+        assert picture.std() > 0.03  # not blank, and not by colour alone
+
+
+def test_cycle_without_a_plan_has_its_height_field_only(folder):
+    save_plan(NoPlan("nothing there"), make_wedge(), folder / "plan.json")
+    assert [path.name for path in write_cycle_figures(folder)] == ["figure_height_field.png"]
+
+
+@pytest.mark.parametrize(
+    "name", ["plan.json", "signals.parquet", "recording.npz", "outcome.json", "scenario.json"]
+)
+def test_missing_or_broken_file_is_named(folder, name):
+    (folder / name).write_bytes(b"broken")
+    with pytest.raises(InputError, match=name):
+        write_cycle_figures(folder)
+    (folder / name).unlink()
+    with pytest.raises(InputError, match=f"{name}.*no such file"):
+        write_cycle_figures(folder)
+
+
+def test_plan_and_signals_come_back_as_stored(folder, plan):
+    back, field = load_plan(folder / "plan.json")
+    assert back.to_dict() == plan.to_dict()
+    assert np.allclose(field.h, make_wedge().h, atol=1e-4)
+    assert replace(field, h=field.h).x_end == make_wedge().x_end
+    signals, units = load_signals(folder / "signals.parquet")
+    assert set(signals) == {"time", "mode", *COLUMNS}
+    assert set(units.values()) == {"1"}
+    assert signals["time"][-1] == pytest.approx(7.99)
