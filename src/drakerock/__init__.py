@@ -30,9 +30,11 @@ _LAZY: dict[str, str] = {
     "choose_strategy": "drakerock.exploration.strategy",
     "get_pile": "drakerock.study.jobs",
     "load_scenario": "drakerock.loading.scenario",
+    "load_study": "drakerock.study.schema",
     "make_station": "drakerock.loading.station",
     "pareto_front": "drakerock.exploration.pareto",
     "run_cycle": "drakerock.loading.cycle",
+    "run_study": "drakerock.study.runner",
 }
 
 __all__ = ["__version__", *_LAZY]

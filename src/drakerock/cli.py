@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from drakerock.errors import InputError, SimulationFailure
+from drakerock.errors import InputError, RunStopped, SimulationFailure
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -46,6 +46,10 @@ def main() -> None:
         sys.exit(2)
     except SimulationFailure as error:
         _print_error("failed", error)
+        sys.exit(1)
+    except RunStopped as error:
+        _print_error("stopped", error)
+        console.print("what was finished is stored; the same command goes on")
         sys.exit(1)
     except KeyboardInterrupt:
         console.print("interrupted")
@@ -198,6 +202,104 @@ def machine_show(
     with _show_progress("machine show"):
         path = write_machine_page(_load(scenario, None, set_).machine, out / "machine.html")
     _print_paths([path])
+
+
+study_app = typer.Typer(no_args_is_help=True, help="Campaigns: many sequences of loadings, stored.")
+app.add_typer(study_app, name="study")
+StudyFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a study.")]
+
+
+@study_app.command("run")
+def study_run(
+    study: Annotated[Path, typer.Argument(help="Study YAML file.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the study; made if missing.")],
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes [default: one per core].")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to run on.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a study key (dotted).")
+    ] = None,
+    json_: JsonOption = False,
+) -> None:
+    """Run a study, or go on with one that was interrupted. Ctrl-C once: finish the running cycles; twice: now.
+
+    Example: drakerock study run studies/smoke.yaml --out out/smoke --workers 2
+    """
+    from drakerock.study.display import Display, make_status_table
+    from drakerock.study.runner import run_study
+    from drakerock.study.schema import load_study
+
+    config = load_study(study, set_ or ())
+    with Display(console) as display:
+        status = run_study(config, out, workers=workers, scheduler=scheduler, display=display)
+    if json_:
+        print(json.dumps(status))
+        return
+    output.print(make_status_table(status))
+    _print_paths(
+        [out / f"{name}.{suffix}" for suffix in ("csv", "parquet") for name in ("responses", "loadings")]
+    )
+
+
+@study_app.command("status")
+def study_status(folder: StudyFolder, json_: JsonOption = False) -> None:
+    """Show what is done, running, failed (with reasons) and to do; from the store alone.
+
+    Example: drakerock study status out/smoke
+    """
+    from drakerock.study.display import make_status_table
+    from drakerock.study.store import Store
+
+    with Store.open(folder) as store:
+        status = store.read_status()
+    if json_:
+        print(json.dumps(status))
+    else:
+        output.print(make_status_table(status))
+
+
+@study_app.command("export")
+def study_export(
+    folder: StudyFolder,
+    format_: Annotated[str, typer.Option("--format", help="csv or parquet.")] = "csv",
+) -> None:
+    """Write the tables: responses (one row per finished point) and loadings (one row per cycle).
+
+    Example: drakerock study export out/smoke --format parquet
+    """
+    from drakerock.study.store import export_tables
+
+    _print_paths(export_tables(folder, [format_]))
+
+
+@study_app.command("verify")
+def study_verify(folder: StudyFolder, json_: JsonOption = False) -> None:
+    """Check the store: database, checksums, missing files, files that belong to nothing.
+
+    Example: drakerock study verify out/smoke
+    """
+    from drakerock.study.store import Store
+
+    with Store.open(folder) as store:
+        faults = store.verify()
+    if json_:
+        print(json.dumps([vars(fault) for fault in faults]))
+    else:
+        for fault in faults:
+            output.print(Text(f"{fault.kind}: {fault.path} {fault.message}"), soft_wrap=True)
+        output.print(f"{len(faults)} faults" if faults else "no faults")
+    if faults:
+        raise typer.Exit(1)
+
+
+@study_app.command("schema")
+def study_schema() -> None:
+    """Print the JSON Schema of study files, for editors.
+
+    Example: drakerock study schema > study.schema.json
+    """
+    from drakerock.study.schema import make_json_schema
+
+    print(json.dumps(make_json_schema(), indent=2))
 
 
 def _load(path: Path | None, seed: int | None, overrides: list[str] | None) -> Any:

@@ -14,3 +14,10 @@ class SimulationFailure(Exception):
 
     A cycle that raises it is recorded as failed with this message; a campaign goes on.
     """
+
+
+class RunStopped(Exception):
+    """A campaign had to stop: full disk, lost scheduler, workers that cannot work.
+
+    What was finished is stored; the same command goes on once the cause is removed.
+    """

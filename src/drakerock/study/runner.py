@@ -1,0 +1,341 @@
+"""Running a study: the sampler asks, the executor runs, the store records.
+
+The unit of work is a sequence at a point. The points of a sampling step are asked for once all points of the
+steps before have ended, so that they depend on responses only, not on workers or on who finished first.
+Validation points, which depend on nothing, fill the gaps at the ends of the steps.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import floor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drakerock.errors import InputError, RunStopped
+from drakerock.exploration.confirmation import Evaluate
+from drakerock.exploration.noise import calc_autocorrelation, calc_standard_error
+from drakerock.exploration.problem import Array
+from drakerock.exploration.sampling import make_sampler, make_validation_points
+from drakerock.study.display import Display
+from drakerock.study.executors import Executor, WorkerLost, make_executor
+from drakerock.study.objectives import get_objective
+from drakerock.study.schema import StudyConfig
+from drakerock.study.store import Point, Store, export_tables, get_versions, read_outcome
+from drakerock.study.work import Task, TaskResult, run_task
+
+RUN_SEQUENCE = "drakerock.loading.sequence:run_sequence"
+_POLL = 0.5
+
+
+def run_study(
+    study: StudyConfig,
+    folder: str | Path,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    display: Display | None = None,
+    work: str = RUN_SEQUENCE,
+) -> dict[str, Any]:
+    """Run a study to its end, or go on with one that was interrupted; write the response tables.
+
+    The first Ctrl-C lets the running cycles finish; the second, and SIGTERM, stop at once. Whatever stops it,
+    the same call goes on, and ends with the same responses.
+
+    Args:
+        study: what to do.
+        folder: the store; made if missing.
+        workers, scheduler: instead of the study's executor settings.
+        display: shows what goes on; None: nothing.
+        work: the function that runs a sequence, as ``module:name``.
+
+    Returns:
+        The status at the end (`Store.read_status`).
+
+    Raises:
+        InputError: the folder holds another study, cannot be written, or is in use.
+        RunStopped: full disk, lost scheduler, workers that cannot work.
+        KeyboardInterrupt: Ctrl-C, once the running cycles are finished or given up.
+    """
+    with Store.create(folder, study) as store:
+        runner = _Runner(store, display, work)
+        try:
+            runner.run(workers, scheduler)
+        finally:
+            status = store.read_status()
+            if display:
+                display.update(status, last=True)
+    export_tables(folder)
+    return status
+
+
+class _Runner:
+    """One run of a study."""
+
+    def __init__(self, store: Store, display: Display | None, work: str) -> None:
+        self._store, self._study = store, store.study
+        self._display, self._work = display, work
+        self._running: dict[str, _Sequence] = {}
+        self._stop_file = store.folder / f".stop-{time.time_ns()}"
+        self._shown = -1e9
+        self._changed = True
+
+    def run(self, workers: int | None, scheduler: str | None) -> None:
+        for old in self._store.folder.glob(".stop-*"):
+            old.unlink(missing_ok=True)
+        self._store.clean()
+        ending, run = "failed", None
+        executor: Executor | None = None
+        try:
+            with _catch_signals(self._ask_to_stop):
+                executor = make_executor(
+                    self._study.executor, self._look, self._store.folder, workers, scheduler
+                )
+                self._say_start(executor)
+                run = self._store.begin_run(executor.name, executor.n_workers)
+                self._loop(executor)
+            ending = "complete"
+        except (KeyboardInterrupt, SystemExit):
+            ending = "interrupted"
+            raise
+        except RunStopped as error:
+            ending = f"stopped: {error}"
+            raise
+        finally:
+            if executor:
+                executor.close()
+            self._stop_file.unlink(missing_ok=True)
+            if run is not None:
+                self._end(run, ending)
+
+    def _end(self, run: int, ending: str) -> None:
+        try:
+            self._store.end_run(run, ending)
+        except RunStopped:
+            # A full disk cannot even take this; the reason that stopped the run is what counts.
+            if ending == "complete":
+                raise
+
+    def _say_start(self, executor: Executor) -> None:
+        if self._display:
+            self._display.say(f"running on {executor.name}, {executor.n_workers} workers")
+            if executor.dashboard:
+                self._display.say(f"Dask dashboard: {executor.dashboard}")
+
+    def _ask_to_stop(self) -> None:
+        self._stop_file.touch()
+        if self._display:
+            self._display.say("finishing the running cycles; Ctrl-C again stops at once")
+
+    def _loop(self, executor: Executor) -> None:
+        waiting: list[Point] = []
+        while True:
+            stopping = self._stop_file.exists()
+            # What there is to do changes only when a sequence ends.
+            if self._changed and not stopping:
+                self._changed = False
+                waiting = [point for point in self._plan() if point.name not in self._running]
+            while waiting and not stopping and len(self._running) < max(executor.n_workers, 1):
+                self._submit(executor, waiting.pop(0))
+            if self._running:
+                for task, result in executor.wait(_POLL):
+                    self._take(executor, task, result)
+                self._look()
+            elif stopping:
+                raise KeyboardInterrupt
+            elif not waiting and not self._changed:
+                return
+
+    def _plan(self) -> list[Point]:
+        """Return the points that are not finished, sample points first; ask the sampler for more if it is time."""
+        store, study = self._store, self._study
+        config = study.exploration.sampling
+        validation = store.list_points("validation")
+        if len(validation) < config.n_validation:
+            X = make_validation_points(study.problem, config, study.seed)
+            store.add_points("validation", 0, X[len(validation) :])
+            validation = store.list_points("validation")
+        samples = store.list_points("sample")
+        if len(samples) < config.n_samples and all(p.status in ("done", "failed") for p in samples):
+            store.add_points("sample", _next_batch(samples), self._ask(len(samples)))
+            samples = store.list_points("sample")
+        # A study resumed with fewer points leaves the rest be.
+        wanted = samples[: config.n_samples] + validation[: config.n_validation]
+        return [point for point in wanted if point.status not in ("done", "failed")]
+
+    def _ask(self, n_samples: int) -> Array:
+        config = self._study.exploration.sampling
+        sampler = make_sampler(self._study.problem, config, self._study.seed)
+        if n_samples == 0:
+            return sampler.ask(min(len(sampler.initial), config.n_samples))
+        table = self._store.read_responses("sample")
+        sampler.tell(table.X, table.Y, table.noise)
+        # Of an initial design cut short by an earlier, smaller number of points, the rest comes first.
+        left = len(sampler.initial) - n_samples
+        return sampler.ask(min(left if left > 0 else config.batch_size, config.n_samples - n_samples))
+
+    def _submit(self, executor: Executor, point: Point) -> None:
+        attempt = max(point.attempt, 0) + (point.attempt_status == "failed")
+        try:
+            scenario = self._study.make_scenario(point.x, point.name, attempt)
+        except InputError as error:
+            # Ranges are checked at their ends only; a combination may still be impossible.
+            self._store.begin_sequence(point.name, attempt, self._study.scenario)
+            self._store.finish_sequence(point.name, attempt, "failed", str(error))
+            self._changed = True
+            return
+        n_recorded = self._store.begin_sequence(point.name, attempt, scenario)
+        task = Task(
+            point.name, attempt, scenario, self._study.loadings,
+            self._store.find_sequence_folder(point.name, attempt).resolve(), self._stop_file.resolve(),
+            floor(self._study.failures.max_failed_share * self._study.loadings + 1e-9), self._work,
+        )  # fmt: skip
+        self._running[point.name] = _Sequence(task, n_recorded)
+        executor.submit(task)
+
+    def _look(self) -> None:
+        """Record the cycles that have been finished since the last look, and show them."""
+        for sequence in self._running.values():
+            self._record(sequence)
+        if self._display and time.monotonic() - self._shown > 1.0:
+            self._shown = time.monotonic()
+            self._display.update(self._store.read_status())
+
+    def _record(self, sequence: _Sequence) -> None:
+        task, now = sequence.task, time.monotonic()
+        n = self._store.record_cycles(task.point, task.attempt, sequence.n_recorded, now - sequence.since)
+        if n > sequence.n_recorded:
+            sequence.n_recorded, sequence.since, sequence.deaths = n, now, 0
+
+    def _take(self, executor: Executor, task: Task, result: TaskResult | WorkerLost) -> None:
+        sequence = self._running[task.point]
+        self._record(sequence)
+        if isinstance(result, WorkerLost):
+            self._store.add_event("worker lost", f"{task.point} attempt {task.attempt}")
+            if self._display:
+                self._display.say(f"{task.point}: {result}")
+            sequence.deaths += 1
+            if sequence.deaths < self._study.failures.max_worker_deaths:
+                executor.submit(task)
+                return
+            result = TaskResult("failed", f"{result}, {sequence.deaths} times on end")
+        del self._running[task.point]
+        self._changed = True
+        if result.status == "disk":
+            raise RunStopped(f"{task.folder}: {result.reason}")
+        if result.versions != get_versions():
+            raise RunStopped(
+                f"a worker has other versions ({result.versions}) than the runner ({get_versions()})"
+            )
+        if result.status == "done" and sequence.n_recorded != task.n_loadings:
+            result = TaskResult("failed", f"ended after {sequence.n_recorded} of {task.n_loadings} loadings")
+        if result.status == "stopped":
+            return
+        if result.status == "done":
+            self._store.finish_sequence(task.point, task.attempt, "done")
+            return
+        final = result.status == "impossible" or task.attempt >= self._study.failures.retries
+        self._store.finish_sequence(
+            task.point, task.attempt, "failed", result.reason, result.traceback, final=final
+        )
+        if self._display:
+            self._display.say(f"{task.point} attempt {task.attempt + 1} failed: {result.reason}")
+
+
+class _Sequence:
+    """A running sequence: its task, the cycles recorded, since when, and the workers lost on end."""
+
+    def __init__(self, task: Task, n_recorded: int) -> None:
+        self.task, self.n_recorded = task, n_recorded
+        self.since = time.monotonic()
+        self.deaths = 0
+
+
+def make_evaluate(folder: str | Path, work: str = RUN_SEQUENCE) -> Evaluate:
+    """Return the function that simulates a design point of a study anew.
+
+    It runs a sequence as the study does, in ``DIR/confirmation``; interrupted and called again it goes on
+    there. The standard errors use the autocorrelation of the study's own sequences.
+
+    Raises:
+        InputError: there is no study in that folder.
+    """
+    folder = Path(folder)
+    with Store.open(folder) as store:
+        study, loadings = store.study, store.read_loadings()
+    functions = [get_objective(name) for name in study.objectives]
+    rho = []
+    for item in functions:
+        sequences: dict[tuple[str, int], list[float]] = {}
+        for row in loadings.select(["point", "attempt", item.objective.name]).to_pylist():
+            value = row[item.objective.name]
+            key = (row["point"], row["attempt"])
+            sequences.setdefault(key, []).append(np.nan if value is None else value)
+        rho.append(calc_autocorrelation(sequences.values()))
+
+    def evaluate(x: Array) -> tuple[Array, Array]:
+        place = folder / "confirmation" / "_".join(f"{value:.12g}" for value in x)
+        scenario = study.make_scenario(x, "confirmation", 0)
+        task = Task(
+            "confirmation",
+            0,
+            scenario,
+            study.loadings,
+            place.resolve(),
+            place / ".stop",
+            study.loadings,
+            work,
+        )
+        result = run_task(task)
+        if result.status != "done":
+            raise RuntimeError(result.reason)
+        outcomes = [
+            read_outcome(place / f"loading_{number:02d}" / "outcome.json") for number in range(study.loadings)
+        ]
+        Y = np.array(
+            [
+                [np.nan if outcome.status == "failed" else item.function(outcome) for item in functions]
+                for outcome in outcomes
+            ],
+            dtype=float,
+        )
+        means = np.nanmean(Y, axis=0)
+        return means, np.array([calc_standard_error(y, r) for y, r in zip(Y.T, rho, strict=True)])
+
+    return evaluate
+
+
+def _next_batch(points: list[Point]) -> int:
+    return max((point.batch for point in points), default=-1) + 1
+
+
+@contextmanager
+def _catch_signals(ask_to_stop: Any) -> Iterator[None]:
+    """First Ctrl-C: ask to stop; the second raises KeyboardInterrupt; SIGTERM raises SystemExit(143)."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    asked = False
+
+    def interrupt(_number: int, _frame: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        ask_to_stop()
+
+    def terminate(_number: int, _frame: Any) -> None:
+        raise SystemExit(143)
+
+    before = signal.signal(signal.SIGINT, interrupt), signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before[0])
+        signal.signal(signal.SIGTERM, before[1])

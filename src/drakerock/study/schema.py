@@ -1,0 +1,311 @@
+"""The study's YAML: what is varied, what is measured, how much, and where it runs."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
+
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
+from pydantic_core import PydanticCustomError
+
+from drakerock.config import Config, calc_config_hash, load_config
+from drakerock.errors import InputError
+from drakerock.exploration.analysis import ExplorationConfig
+from drakerock.exploration.problem import Array, Problem, Variable
+from drakerock.loading.scenario import Scenario
+from drakerock.randomness import derive_seed
+from drakerock.study.objectives import get_objective, import_module
+
+
+def _find_number(key: str) -> type:
+    """Return int or float, whichever a scenario key holds; a PydanticCustomError if it is no such key."""
+    model: type[BaseModel] | None = Scenario
+    annotation: Any = None
+    for part in key.split("."):
+        names = model.model_fields if model is not None else {}
+        if part not in names:
+            near = difflib.get_close_matches(part, names, n=1)
+            hint = f"did you mean '{near[0]}'? " if near else ""
+            allowed = f"allowed here: {', '.join(sorted(names))}" if names else "there is nothing below it"
+            raise PydanticCustomError(
+                "key", "unknown scenario key '{key}' at '{part}'; {rest}",
+                {"key": key, "part": part, "rest": hint + allowed},
+            )  # fmt: skip
+        annotation = names[part].annotation
+        model = annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
+    kinds = _list_types(annotation)
+    if bool in kinds or not kinds & {int, float}:
+        raise PydanticCustomError("key", "scenario key '{key}' is no number", {"key": key})
+    return float if float in kinds else int
+
+
+def _list_types(annotation: Any) -> set[Any]:
+    if get_origin(annotation) is Annotated:
+        return _list_types(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, UnionType):
+        return {kind for arg in get_args(annotation) for kind in _list_types(arg)}
+    return {annotation}
+
+
+class StudyVariable(Variable):
+    """A design variable: a range, and the scenario key that it sets."""
+
+    key: Annotated[
+        str,
+        Field(
+            description="the scenario key it sets, dotted, such as loading.strategy.alpha; any number may be one"
+        ),
+    ]
+
+    @field_validator("key")
+    @classmethod
+    def _check_key(cls, key: str) -> str:
+        _find_number(key)
+        return key
+
+    @property
+    def is_integer(self) -> bool:
+        """Whether the key holds whole numbers; the simulation then gets the variable's value rounded."""
+        return _find_number(self.key) is int
+
+
+class FailureConfig(Config):
+    """What happens when a sequence fails: an error, or too many failed cycles."""
+
+    retries: Annotated[int, Field(ge=0, le=10, description="further attempts before the point is marked")] = 2
+    new_seed: Annotated[bool, Field(description="an attempt has its own seed, thus its own pile")] = True
+    time_step_factor: Annotated[
+        float, Field(gt=0, le=1, description="on the scenario's time step, once per further attempt")
+    ] = 0.5
+    max_failed_share: Annotated[
+        float,
+        Field(ge=0, lt=1, description="a sequence with no more failed cycles than this counts as it is"),
+    ] = 0.1
+    max_worker_deaths: Annotated[
+        int,
+        Field(ge=1, description="workers lost on end, without a finished cycle, before the sequence failed"),
+    ] = 3
+
+
+class SlurmConfig(Config):
+    """Batch jobs, one worker each, asked of Slurm through dask-jobqueue."""
+
+    queue: Annotated[str | None, Field(description="partition")] = None
+    account: str | None = None
+    walltime: Annotated[str, Field(pattern=r"^(\d+-)?\d{1,2}:\d{2}:\d{2}$", description="of one job")] = (
+        "24:00:00"
+    )
+    memory: Annotated[str, Field(description="of one job, such as 4GB")] = "4GB"
+    directives: Annotated[tuple[str, ...], Field(description="further #SBATCH lines, without #SBATCH")] = ()
+    prologue: Annotated[tuple[str, ...], Field(description="shell lines before the worker starts")] = ()
+
+
+class ExecutorConfig(Config):
+    """Where the sequences run. Has no influence on the results."""
+
+    kind: Annotated[
+        Literal["local", "serial", "slurm"],
+        Field(description="processes of this machine; this process itself; batch jobs"),
+    ] = "local"
+    workers: Annotated[int | None, Field(ge=1, description="none: one per core; slurm: jobs, none: 10")] = (
+        None
+    )
+    scheduler: Annotated[str | None, Field(description="address of a running Dask scheduler to use")] = None
+    memory_limit: Annotated[
+        str, Field(description="per local worker, such as 4GB; auto: the memory's even share; 0: none")
+    ] = "auto"
+    slurm: SlurmConfig = SlurmConfig()
+
+
+class StorageConfig(Config):
+    """What stays of a finished sequence."""
+
+    keep: Annotated[
+        Literal["everything", "outcomes"],
+        Field(description="all files of each cycle (piles, signals, recording), or outcome and plan only"),
+    ] = "everything"
+
+
+_METHOD_VARIABLES = tuple(
+    StudyVariable(**variable.model_dump(), key=f"loading.strategy.{variable.name}")
+    for variable in Problem().variables
+)
+
+
+class StudyConfig(Config):
+    """A campaign: points of the design space, each a sequence of loadings."""
+
+    name: str = "study"
+    seed: Annotated[int, Field(ge=0, description="of the sampling plan; the scenario has its own")] = 0
+    scenario_file: Annotated[
+        str | None, Field(description="the scenario all points share, relative to this file")
+    ] = None
+    scenario: Annotated[Scenario, Field(description="the scenario, or what differs from scenario_file")] = (
+        Scenario()
+    )
+    variables: Annotated[tuple[StudyVariable, ...], Field(min_length=1)] = _METHOD_VARIABLES
+    modules: Annotated[
+        tuple[str, ...],
+        Field(description="Python modules that register objectives: names, or .py files beside this one"),
+    ] = ()
+    objectives: Annotated[
+        tuple[str, ...], Field(min_length=1, description="registered functions of a cycle's outcome")
+    ] = ("production", "damage", "debris")
+    loadings: Annotated[int, Field(ge=1, le=1000, description="loadings in a sequence")] = 20
+    independent_piles: Annotated[
+        bool, Field(description="each point has a seed and thus an original pile of its own")
+    ] = False
+    exploration: ExplorationConfig = ExplorationConfig()
+    failures: FailureConfig = FailureConfig()
+    executor: ExecutorConfig = ExecutorConfig()
+    storage: StorageConfig = StorageConfig()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        keys = [variable.key for variable in self.variables]
+        twice = sorted({key for key in keys if keys.count(key) > 1})
+        if twice:
+            raise ValueError(f"variables: one variable per scenario key; used twice: {', '.join(twice)}")
+        try:
+            for module in self.modules:
+                import_module(module)
+            problem = self.problem
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        # The ends of every range must be scenarios; what lies between is then taken to be one.
+        for variable in problem.variables:
+            for end in (variable.low, variable.high):
+                middle = {v.name: v.low + 0.5 * (v.high - v.low) for v in self.variables}
+                try:
+                    self._set_variables(middle | {variable.name: end})
+                except ValidationError as error:
+                    message = error.errors()[0]["msg"].removeprefix("Value error, ")
+                    raise ValueError(
+                        f"variables: {variable.name} = {end:g} is not a possible scenario: {message}"
+                    ) from None
+        return self
+
+    @property
+    def problem(self) -> Problem:
+        """Variables and objectives as the exploration knows them."""
+        fields = Variable.model_fields
+        return Problem(
+            variables=tuple(Variable(**{name: getattr(v, name) for name in fields}) for v in self.variables),
+            objectives=tuple(get_objective(name).objective for name in self.objectives),
+        )
+
+    def make_scenario(self, x: Array, point: str = "", attempt: int = 0) -> Scenario:
+        """Return the scenario of one sequence.
+
+        Args:
+            x: (d,) the design point, in the variables' units.
+            point: the point's identifier; of influence with `independent_piles` only.
+            attempt: 0, or the number of the retry, which has another seed and a smaller time step.
+
+        Raises:
+            InputError: the values make no valid scenario.
+        """
+        values = dict(zip((v.name for v in self.variables), map(float, x), strict=True))
+        try:
+            scenario = self._set_variables(values)
+        except ValidationError as error:
+            message = error.errors()[0]["msg"].removeprefix("Value error, ")
+            raise InputError(f"{values} make no valid scenario: {message}") from None
+        seed, step = scenario.seed, scenario.dynamics.time_step
+        if self.independent_piles:
+            seed = derive_seed(seed, "point", point)
+        if attempt:
+            seed = derive_seed(seed, "attempt", attempt) if self.failures.new_seed else seed
+            step *= self.failures.time_step_factor**attempt
+        dynamics = scenario.dynamics.model_copy(update={"time_step": step})
+        return scenario.model_copy(update={"seed": seed, "dynamics": dynamics})
+
+    def _set_variables(self, values: Mapping[str, float]) -> Scenario:
+        data = self.scenario.model_dump(mode="json")
+        for variable in self.variables:
+            *parents, last = variable.key.split(".")
+            target = data
+            for part in parents:
+                target = target[part]
+            value = values[variable.name]
+            target[last] = round(value) if variable.is_integer else value
+        return Scenario.model_validate(data)
+
+    def calc_identity(self) -> str:
+        """Return the hash of all that the results depend on.
+
+        Where it runs, what is kept, how the results are analysed and how many points are wanted are no part
+        of it: they may be changed when a study is resumed.
+        """
+        sampling = self.exploration.sampling.model_copy(update={"n_samples": 1, "n_validation": 0})
+        neutral = {
+            "name": "study",
+            "executor": ExecutorConfig(),
+            "storage": StorageConfig(),
+            "exploration": ExplorationConfig(sampling=sampling),
+        }
+        return calc_config_hash(self.model_copy(update=neutral))
+
+
+def load_study(path: str | Path, overrides: Sequence[str] = ()) -> StudyConfig:
+    """Read a study.
+
+    The result is resolved: its scenario is whole, `scenario_file` is None, modules in files have full paths.
+
+    Args:
+        path: the YAML file.
+        overrides: ``"dotted.key=value"`` strings on top of it, such as ``loadings=2`` or
+            ``scenario.pile.rocks=100``.
+
+    Raises:
+        InputError: see `drakerock.config.load_config`; also an unknown scenario key or objective, a range
+            that the scenario does not allow, a module that cannot be imported.
+    """
+    path = Path(path)
+    first = load_config(path, _StudyFile, overrides)
+    data = first.model_dump(mode="json", exclude_unset=True)
+    if first.scenario_file is not None:
+        # A shipped study may lie in a wheel: what it names is beside it.
+        base = load_config(path.parent / first.scenario_file, Scenario).model_dump(mode="json")
+        data["scenario"] = _merge(base, data.get("scenario", {}))
+    data.pop("scenario_file", None)
+    data["modules"] = [
+        str((path.parent / module).resolve()) if module.endswith(".py") else module
+        for module in first.modules
+    ]
+    try:
+        return StudyConfig.model_validate(data)
+    except ValidationError as error:
+        item = error.errors()[0]
+        where = ".".join(str(part) for part in item["loc"])
+        message = item["msg"].removeprefix("Value error, ")
+        raise InputError(f"{path}: {where + ': ' if where else ''}{message}") from None
+
+
+def make_json_schema() -> dict[str, Any]:
+    """Return the JSON Schema of a study file, for editors."""
+    schema = StudyConfig.model_json_schema()
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **schema,
+        "title": "drakerock study",
+    }
+
+
+class _StudyFile(StudyConfig):
+    """A study as it stands in its file: checks that need the whole scenario come after it is whole."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        return self
+
+
+def _merge(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    result = dict(base)
+    for key, value in changes.items():
+        nested = isinstance(value, Mapping) and isinstance(result.get(key), dict)
+        result[key] = _merge(result[key], value) if nested else value
+    return result

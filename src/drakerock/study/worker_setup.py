@@ -1,0 +1,11 @@
+"""Loaded by Dask into each local worker before it starts."""
+
+from __future__ import annotations
+
+import signal
+from typing import Any
+
+
+def dask_setup(_worker: Any) -> None:
+    """Ignore Ctrl-C, which a terminal sends to all its processes: the runner decides when workers stop."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
