@@ -20,7 +20,6 @@ from drakerock.viewing.pile_figures import write_pile_picture
 from drakerock.viewing.pile_page import write_pile_page
 from drakerock.viewing.replay import write_replay
 
-
 # Woken rocks of a pile at rest creep no faster: 30 mm in 5 s [m/s].
 REST_SPEED = 0.006
 
