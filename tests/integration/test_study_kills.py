@@ -165,7 +165,9 @@ def kill_workers(place, reference, n_kills, seed):
     while process.poll() is None and kills < n_kills:
         before, begun = place.count("start").total(), time.monotonic()
         # Mostly at work, sometimes while they start; killing these only would keep the study from its end.
-        while rng.random() < 0.99 and place.count("start").total() == before and time.monotonic() - begun < 20:
+        while (
+            rng.random() < 0.99 and place.count("start").total() == before and time.monotonic() - begun < 20
+        ):
             time.sleep(0.02)
         workers = find_workers(process)
         if workers:
