@@ -39,6 +39,8 @@ def run(scenario, n_loadings, folder, *, progress=None):
             outcome = _load(scenario, number, state, place, progress)
         state = json.loads((place / "state.json").read_text())
         outcomes.append(outcome)
+        if outcome.status == "failed":
+            break
     return outcomes
 
 

@@ -291,6 +291,67 @@ def study_verify(folder: StudyFolder, json_: JsonOption = False) -> None:
         raise typer.Exit(1)
 
 
+@study_app.command("report")
+def study_report(
+    source: Annotated[Path, typer.Argument(metavar="DIR", help="Study folder or response table.")],
+    out: Annotated[Path | None, typer.Option(help="Folder to write into [default: DIR/report].")] = None,
+) -> None:
+    """Fit, validate and explore; write one self-contained report.html with figures and numbers.
+
+    Example: drakerock study report out/paper
+    """
+    from drakerock.study.analysis import run_report
+
+    _print_paths(run_report(source, out))
+
+
+@study_app.command("confirm")
+def study_confirm(
+    folder: StudyFolder,
+    points: Annotated[int | None, typer.Option(help="How many front points to simulate again.")] = None,
+    json_: JsonOption = False,
+) -> None:
+    """Simulate chosen Pareto points again: predicted against simulated. Interrupted, it goes on when called again.
+
+    Example: drakerock study confirm out/paper --points 5
+    """
+    from drakerock.study.analysis import format_confirmation, run_confirm
+    from drakerock.study.runner import make_evaluate
+
+    confirmation = run_confirm(folder, make_evaluate(folder), points)
+    if json_:
+        print(json.dumps(confirmation.to_rows(), indent=2))
+    else:
+        print(format_confirmation(confirmation))
+        _print_paths([folder / "confirmation.json"])
+
+
+@app.command()
+def strategy(
+    source: Annotated[Path, typer.Argument(metavar="DIR", help="Study folder or response table.")],
+    weights: Annotated[
+        str | None, typer.Option(help="Trade-off, such as production=0.6,damage=0.2,debris=0.2.")
+    ] = None,
+    bound: Annotated[
+        list[str] | None,
+        typer.Option("--bound", "--bounds", help="Limit, such as 'debris<=500'; repeatable."),
+    ] = None,
+    knee: Annotated[bool, typer.Option("--knee", help="The knee point (what no weights mean).")] = False,
+    json_: JsonOption = False,
+) -> None:
+    """Print the Pareto-optimal strategy for a trade-off.
+
+    Example: drakerock strategy out/paper --weights production=0.6,damage=0.2,debris=0.2
+    """
+    from drakerock.study.analysis import run_strategy
+
+    if knee and weights is not None:
+        raise InputError("--knee and --weights exclude each other")
+    limits = [part for text in bound or [] for part in text.split(",") if part.strip()]
+    chosen = run_strategy(source, weights, limits)
+    print(json.dumps(chosen.to_dict(), indent=2) if json_ else chosen.to_text())
+
+
 @study_app.command("schema")
 def study_schema() -> None:
     """Print the JSON Schema of study files, for editors.

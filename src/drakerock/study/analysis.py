@@ -1,18 +1,18 @@
-"""What a finished (or running) study says: report, confirmation, strategy. Functions, and their commands.
+"""What a finished (or running) study says: report, confirmation, strategy.
 
-A source is a study folder with an exported table (`responses.parquet` or `responses.csv`) and, where there is
-one, `study.json` beside it; or such a table alone. Of `study.json`, `problem` (variables and objectives),
-`exploration` (settings, an `ExplorationConfig`) and `seed` are used, and all of it is shown in the report.
+A source is a study folder, whose store is exported first; or a folder with a table (`responses.parquet` or
+`responses.csv`) and, where there is one, `study.json` beside it; or such a table alone. Of `study.json`, `problem`
+(variables and objectives), `exploration` (settings, an `ExplorationConfig`) and `seed` are used, and all of it is
+shown in the report.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from pydantic import ValidationError
 
 from drakerock.errors import InputError
@@ -23,6 +23,7 @@ from drakerock.exploration.problem import Problem, format_number
 from drakerock.exploration.strategy import Strategy, choose_strategy, parse_weights
 from drakerock.exploration.surrogate import fit_surrogate
 from drakerock.exploration.table import ResponseTable
+from drakerock.study.store import DATABASE, export_tables
 
 _CONFIRMATION = "confirmation.json"
 
@@ -99,68 +100,6 @@ def run_confirm(source: str | Path, evaluate: Evaluate, n: int | None = None) ->
     return confirmation
 
 
-def add_commands(app: typer.Typer, study: typer.Typer, make_evaluate: Callable[[Path], Evaluate]) -> None:
-    """Add `strategy` to `app`, and `report` and `confirm` to its `study` group.
-
-    Args:
-        app: the program.
-        study: its group of study commands.
-        make_evaluate: from a study folder to the function that simulates a design point of that study.
-    """
-
-    @study.command("report")
-    def report(
-        source: Annotated[Path, typer.Argument(metavar="DIR", help="Study folder or response table.")],
-        out: Annotated[Path | None, typer.Option(help="Folder to write into [default: DIR/report].")] = None,
-    ) -> None:
-        """Fit, validate and explore; write one self-contained report.html with figures and numbers.
-
-        Example: drakerock study report out/paper
-        """
-        for path in run_report(source, out):
-            typer.echo(f"wrote {path}")
-
-    @study.command("confirm")
-    def confirm(
-        source: Annotated[Path, typer.Argument(metavar="DIR", help="Study folder.")],
-        points: Annotated[int | None, typer.Option(help="How many front points to simulate again.")] = None,
-        as_json: Annotated[bool, typer.Option("--json", help="Print only JSON.")] = False,
-    ) -> None:
-        """Simulate chosen Pareto points again: predicted against simulated.
-
-        Example: drakerock study confirm out/paper --points 5
-        """
-        confirmation = run_confirm(source, make_evaluate(source), points)
-        if as_json:
-            typer.echo(json.dumps(confirmation.to_rows(), indent=2))
-        else:
-            typer.echo(format_confirmation(confirmation))
-            typer.echo(f"wrote {_find_folder(source) / _CONFIRMATION}")
-
-    @app.command("strategy")
-    def strategy(
-        source: Annotated[Path, typer.Argument(metavar="DIR", help="Study folder or response table.")],
-        weights: Annotated[
-            str | None, typer.Option(help="Trade-off, such as production=0.6,damage=0.2,debris=0.2.")
-        ] = None,
-        bound: Annotated[
-            list[str] | None,
-            typer.Option("--bound", "--bounds", help="Limit, such as 'debris<=500'; repeatable."),
-        ] = None,
-        knee: Annotated[bool, typer.Option("--knee", help="The knee point (what no weights mean).")] = False,
-        as_json: Annotated[bool, typer.Option("--json", help="Print only JSON.")] = False,
-    ) -> None:
-        """Print the Pareto-optimal strategy for a trade-off.
-
-        Example: drakerock strategy out/paper --weights production=0.6,damage=0.2,debris=0.2
-        """
-        if knee and weights is not None:
-            raise InputError("--knee and --weights exclude each other")
-        limits = [part for text in bound or [] for part in text.split(",") if part.strip()]
-        chosen = run_strategy(source, weights, limits)
-        typer.echo(json.dumps(chosen.to_dict(), indent=2) if as_json else chosen.to_text())
-
-
 def format_confirmation(confirmation: Confirmation) -> str:
     """Return predicted against simulated as text, one line per point and objective."""
     problem = confirmation.problem
@@ -191,6 +130,8 @@ def _find_folder(source: Path) -> Path:
 
 
 def _load(source: Path) -> tuple[ResponseTable, ExplorationConfig, int]:
+    if (source / DATABASE).exists():
+        export_tables(source, ["parquet"])
     table = ResponseTable.load(source)
     path = _find_folder(source) / "study.json"
     try:

@@ -73,7 +73,7 @@ class StudyVariable(Variable):
 
 
 class FailureConfig(Config):
-    """What happens when a sequence fails: an error, or too many failed cycles."""
+    """What happens when a sequence fails: by an error, or by a failed cycle, which is its last."""
 
     retries: Annotated[int, Field(ge=0, le=10, description="further attempts before the point is marked")] = 2
     new_seed: Annotated[bool, Field(description="an attempt has its own seed, thus its own pile")] = True
@@ -82,7 +82,9 @@ class FailureConfig(Config):
     ] = 0.5
     max_failed_share: Annotated[
         float,
-        Field(ge=0, lt=1, description="a sequence with no more failed cycles than this counts as it is"),
+        Field(
+            ge=0, lt=1, description="a sequence that lacks no more of its loadings, failed or not run, counts"
+        ),
     ] = 0.1
     max_worker_deaths: Annotated[
         int,

@@ -46,7 +46,7 @@ class Task:
         n_loadings: how many loadings.
         folder: where its files go; a file system that all workers and the runner share.
         stop_file: while it exists, no new loading is begun.
-        max_failed: a sequence with more failed cycles has failed.
+        max_failed: a sequence that lacks more of its loadings, failed or not run, has failed.
         work: the function that runs it, as ``module:name`` (workers import it).
     """
 
@@ -81,10 +81,6 @@ class _Stop(Exception):
     pass
 
 
-class _TooManyFailed(Exception):
-    pass
-
-
 def run_task(task: Task, tick: Callable[[], None] | None = None) -> TaskResult:
     """Run a sequence, or what is left of it. Never raises but for an interruption.
 
@@ -100,9 +96,6 @@ def run_task(task: Task, tick: Callable[[], None] | None = None) -> TaskResult:
             begun = loading
             if task.stop_file.exists():
                 raise _Stop
-            # After a failed loading the next one starts from the same pile: more of the same would follow.
-            if len(_list_failed(task)) > task.max_failed:
-                raise _TooManyFailed
         if tick:
             tick()
 
@@ -110,19 +103,19 @@ def run_task(task: Task, tick: Callable[[], None] | None = None) -> TaskResult:
         task.folder.parent.mkdir(parents=True, exist_ok=True)
         with _hold(task):
             find_work(task.work)(task.scenario, task.n_loadings, task.folder, progress=progress)
-        failed = _list_failed(task)
+        n_good, failure = _count_good(task)
     except _Stop:
         return TaskResult("stopped")
-    except _TooManyFailed:
-        failed = _list_failed(task)
     except Exception as error:  # whatever a simulation dies of is a result
         text = "".join(traceback.format_exception(error))
         reason = f"{type(error).__name__}: {error}"
         if is_disk_trouble(error):
             return TaskResult("disk", reason, text)
         return TaskResult("impossible" if isinstance(error, InputError) else "failed", reason, text)
-    if len(failed) > task.max_failed:
-        return TaskResult("failed", f"{len(failed)} failed cycles of at most {task.n_loadings}: {failed[0]}")
+    if n_good < task.n_loadings - task.max_failed:
+        return TaskResult(
+            "failed", f"{n_good} of {task.n_loadings} loadings done: {failure or 'no more were run'}"
+        )
     return TaskResult("done")
 
 
@@ -141,17 +134,19 @@ def is_disk_trouble(error: BaseException | None) -> bool:
     return False
 
 
-def _list_failed(task: Task) -> list[str]:
-    """Return the reasons of the failed cycles of a task so far."""
-    reasons = []
+def _count_good(task: Task) -> tuple[int, str]:
+    """Return how many loadings of a task are done, and the first one's reason that failed, "" if none did."""
+    n_good, failure = 0, ""
     for number in range(task.n_loadings):
         path = task.folder / f"loading_{number:02d}" / "outcome.json"
         if not path.exists():
             break
         outcome = read_outcome(path)
         if outcome.status == "failed":
-            reasons.append(outcome.reason)
-    return reasons
+            failure = failure or outcome.reason
+        else:
+            n_good += 1
+    return n_good, failure
 
 
 @contextmanager

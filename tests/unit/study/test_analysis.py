@@ -2,17 +2,17 @@ import json
 
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
 import drakerock
+from drakerock.cli import app
 from drakerock.errors import InputError
 from drakerock.exploration.analysis import ExplorationConfig
 from drakerock.exploration.pareto import ParetoConfig
 from drakerock.exploration.problems import make_noisy_loading, make_noisy_table
 from drakerock.exploration.sensitivity import SensitivityConfig
 from drakerock.exploration.surrogate import SurrogateConfig
-from drakerock.study.analysis import add_commands, run_confirm, run_report, run_strategy
+from drakerock.study.analysis import run_confirm, run_report, run_strategy
 
 KNOWN = make_noisy_loading()
 QUICK = ExplorationConfig(
@@ -38,11 +38,9 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
-def run():
-    app, study = typer.Typer(), typer.Typer()
-    add_commands(app, study, lambda path: evaluate)
-    app.add_typer(study, name="study")
+@pytest.fixture
+def run(monkeypatch):
+    monkeypatch.setattr("drakerock.study.runner.make_evaluate", lambda path: evaluate)
     return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
 
 

@@ -187,15 +187,15 @@ def test_failures_are_retried_with_another_seed_and_step(tmp_path, behave):
     assert [row[3] for row in rows] == ["failed", "done"]
     assert rows[0][2] != rows[1][2]
     assert "made to fail" in rows[0][4]
-    # The sequence is given up at its first failed cycle: a tenth of four is none.
     assert not (tmp_path / "store/points" / min(failed) / "attempt_0/loading_02").exists()
 
 
 def test_some_failed_cycles_can_be_allowed(tmp_path, behave):
     behave("fail")
-    status = run_study(make_study("failures.max_failed_share=0.3"), tmp_path / "store", work=WORK)
-    assert status["cycles"]["recorded"] == 76
+    status = run_study(make_study("failures.max_failed_share=0.8"), tmp_path / "store", work=WORK)
+    assert status["points"]["done"] == 19
     table = ResponseTable.load(tmp_path / "store")
+    assert set(table.n_loadings) == {2, 4}
     assert sum(table.n_failed) == status["cycles"]["failed"] == int((table.X[:, 0] > 1.5).sum())
     assert np.isfinite(table.Y).all()
 

@@ -1,0 +1,75 @@
+"""The shipped smoke study with the real simulation, by the real command."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from drakerock.exploration.table import ResponseTable
+from drakerock.resources import find_data
+from drakerock.study.schema import load_study
+from drakerock.study.store import Store
+
+COMMAND = Path(sys.executable).with_name("drakerock")
+SETTINGS = [
+    "--set", "exploration.sampling.n_initial=3", "--set", "exploration.sampling.n_samples=3",
+    "--set", "exploration.sampling.n_validation=0", "--set", "loadings=2",
+]  # fmt: skip
+
+
+def start(folder, out, *args):
+    command = [
+        str(COMMAND),
+        "study",
+        "run",
+        str(find_data("studies", "smoke.yaml")),
+        "--out",
+        out,
+        *SETTINGS,
+        *args,
+    ]
+    return subprocess.Popen(
+        command, cwd=folder, env=os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def test_a_real_study_killed_in_a_cycle_ends_the_same(tmp_path):
+    straight = start(tmp_path, "straight", "--workers", "1", "--json")
+    out, err = straight.communicate(timeout=300)
+    assert straight.returncode == 0, err
+    assert json.loads(out)["complete"]
+    killed = start(tmp_path, "killed", "--set", "executor.kind=serial")
+    first = tmp_path / "killed/points/s0001/attempt_0/loading_00/outcome.json"
+    while not first.exists():
+        assert killed.poll() is None
+        time.sleep(0.05)
+    time.sleep(0.5)
+    killed.send_signal(signal.SIGKILL)
+    killed.communicate()
+    before = first.stat().st_mtime_ns
+    again = start(tmp_path, "killed", "--workers", "2")
+    _, err = again.communicate(timeout=300)
+    assert again.returncode == 0, err
+    assert first.stat().st_mtime_ns == before
+    for name in ("responses.csv", "responses.parquet"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "straight" / name).read_bytes()
+    with Store.open(tmp_path / "killed") as store:
+        assert store.verify() == []
+    table = ResponseTable.load(tmp_path / "killed")
+    assert table.Y.shape == (3, 3)
+    assert set(table.n_loadings) == {2}
+
+
+@pytest.mark.parametrize("name", ["smoke", "reduced", "paper", "control_parameters"])
+def test_shipped_studies_can_be_read(name):
+    study = load_study(find_data("studies", f"{name}.yaml"))
+    sampling = study.exploration.sampling
+    n_cycles = (sampling.n_samples + sampling.n_validation) * study.loadings
+    assert n_cycles == {"smoke": 10, "reduced": 760, "paper": 4880, "control_parameters": 290}[name]
+    assert find_data("studies", f"{name}.py").exists()
