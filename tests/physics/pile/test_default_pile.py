@@ -27,7 +27,7 @@ def pile():
 
 
 def test_full_size_study_takes_the_shipped_pile():
-    scenario = load_scenario(find_data("studies", "full.yaml"))
+    scenario = load_scenario(find_data("studies", "demo.yaml"))
     assert calc_config_hash(make_recipe(scenario)) == calc_config_hash(RECIPE)
 
 
