@@ -39,7 +39,10 @@ def start(folder, out, *args):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_real_study_killed_in_a_cycle_ends_the_same(tmp_path):
+    # Kernels just compiled and kernels from the cache round differently: have all of them in the cache first.
+    start(tmp_path, "warm", "--set", "executor.kind=serial").communicate(timeout=400)
     straight = start(tmp_path, "straight", "--workers", "1", "--json")
     out, err = straight.communicate(timeout=300)
     assert straight.returncode == 0, err

@@ -64,10 +64,10 @@ class Place:
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
 
-    def finish(self, process, code=0, timeout=120):
+    def finish(self, process, code=0, timeout=120, quiet=True):
         out, err = process.communicate(timeout=timeout)
         assert process.returncode == code, (process.returncode, out, err)
-        assert "Traceback" not in out + err, err
+        assert not quiet or "Traceback" not in out + err, err
         return out, err
 
     def run(self, *args, **values):
@@ -303,7 +303,7 @@ def test_workers_end_with_a_killed_main_process(place):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("mode", "setting"), [("die", []), ("memory", ["--set", "executor.memory_limit=600MB"])]
+    ("mode", "setting"), [("die", []), ("memory", ["--set", "executor.memory_limit=1.2GB"])]
 )
 def test_a_point_that_kills_its_worker_is_marked(place, mode, setting):
     """Killed at each attempt, or out of memory: the point is marked, the others are done."""
@@ -351,8 +351,8 @@ def test_a_lost_scheduler(place, reference):
     process = place.start("--scheduler", address, STUDY_WORK_SECONDS="0.2")
     place.wait_for(3)
     stop(scheduler)
-    _, err = place.finish(process, code=1)
-    assert "the scheduler was lost" in err
+    _, err = place.finish(process, code=1, quiet=False)  # Dask logs its own vain attempts to connect again
+    assert "stopped: the scheduler was lost" in err
     assert "the same command goes on" in err
     stop(worker)
     scheduler, address = start_cluster(place.folder, "scheduler", "--port", "0", "--no-dashboard")

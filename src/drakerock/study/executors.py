@@ -136,7 +136,8 @@ class DaskExecutor(Executor):
 
     def wait(self, timeout: float) -> list[Ended]:
         """Return the tasks that have ended."""
-        from distributed import wait
+        from distributed import CancelledError, wait
+        from distributed.client import FuturesCancelledError
 
         if not self._futures:
             time.sleep(timeout)
@@ -145,22 +146,23 @@ class DaskExecutor(Executor):
             wait(list(self._futures), timeout=timeout, return_when="FIRST_COMPLETED")
         except TimeoutError:
             pass
-        except (OSError, RuntimeError) as error:
-            raise RunStopped(f"the scheduler was lost: {error}") from None
+        except (CancelledError, FuturesCancelledError, OSError, RuntimeError):
+            raise RunStopped("the scheduler was lost") from None
         return [self._end(future) for future in list(self._futures) if future.done()]
 
     def _end(self, future: Any) -> Ended:
-        from distributed import KilledWorker
+        from distributed import CancelledError, KilledWorker
+        from distributed.client import FutureCancelledError
 
-        if future.status == "finished":
-            result = future.result()
-            return self._futures.pop(future), result
-        if future.status == "error":
-            error = future.exception()
-            if isinstance(error, KilledWorker):
-                return self._futures.pop(future), WorkerLost("the worker died (killed, or out of memory)")
-            raise RunStopped(f"the workers cannot run the work: {type(error).__name__}: {error}")
-        raise RunStopped("the scheduler was lost")
+        try:
+            result = future.result(timeout=30)
+        except KilledWorker:
+            return self._futures.pop(future), WorkerLost("the worker died (killed, or out of memory)")
+        except (CancelledError, FutureCancelledError, OSError, TimeoutError):
+            raise RunStopped("the scheduler was lost") from None
+        except Exception as error:  # whatever Dask meets; what the work meets is in its result
+            raise RunStopped(f"the workers cannot run the work: {type(error).__name__}: {error}") from None
+        return self._futures.pop(future), result
 
     def close(self) -> None:
         """Close the client and the cluster that is ours, killing its workers."""
