@@ -24,9 +24,6 @@ Vector = tuple[float, float, float]
 
 _log = logging.getLogger(__name__)
 
-# Fused multiply-adds and reordered sums, but NaN and infinity stay what they are, so that they can be found.
-_FASTMATH = {"contract", "arcp", "nsz", "reassoc"}
-
 
 @lru_cache(maxsize=1)
 def find_cache_folder() -> Path:
@@ -41,11 +38,13 @@ def find_cache_folder() -> Path:
 
 def kernel[Function: Callable[..., Any]](function: Function) -> Function:
     """Decorate a function over arrays and numbers to be compiled on first use and cached on disk."""
+    # Strict arithmetic: with fused or reordered operations the results depend on what the compiler inlines, and
+    # that differs between kernels just compiled and kernels from the cache. It costs a tenth of the time.
     # numba reads its cache folder when it decorates; other users of numba must not see ours.
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(find_cache_folder())
     try:
-        decorated: Function = numba.njit(cache=True, fastmath=_FASTMATH, error_model="numpy")(function)
+        decorated: Function = numba.njit(cache=True, error_model="numpy")(function)
     finally:
         numba.config.CACHE_DIR = before
     return decorated
