@@ -26,7 +26,8 @@ waiting = sample_rocks(60, scenario.rocks, shapes, rng)
 pile, _ = place_rocks(waiting, make_empty_pile(), shapes, make_emitter(scenario.site, scenario.pile), rng)
 pile = replace(pile, p_WRs=pile.p_WRs - [0, 0, pile.p_WRs[:, 2].min() - 0.6])
 engine = NonsmoothEngine(
-    scenario.rocks, shapes, make_site(scenario.site), scenario.dynamics.nonsmooth, 0.01, pile.shape, pile.size, pile.fixed
+    scenario.rocks, shapes, make_site(scenario.site), scenario.dynamics.nonsmooth, 0.01,
+    pile.shape, pile.size, pile.fixed,
 )
 arrays = engine.make_arrays(pile)
 for _ in range(150):

@@ -57,9 +57,9 @@ class NonsmoothRocks(LeafSystem):
     One solve per step: a cache entry computed from the state at t_n, read by the discrete update and by
     ``spatial_forces`` alike. ``rock_summary`` and ``F_B_W`` are state, so that reading them solves nothing: they
     belong to the step taken last. A log's row at t_n is written before the update at t_n, so it holds the step that
-    ended there; `drakerock.loading.signals` moves it to the step's beginning. All state is discrete and numeric, the contact memory and the bookkeeping of the
-    reduction included, so a context can be saved, restored and repeated bit for bit. The engine's scratch
-    memory is shared by all contexts: one thread at a time.
+    ended there; `drakerock.loading.signals` moves it to the step's beginning. All state is discrete and numeric,
+    the contact memory and the bookkeeping of the reduction included, so a context can be saved, restored and
+    repeated bit for bit. The engine's scratch memory is shared by all contexts: one thread at a time.
 
     Input port:
         ``machine_step``: a `MachineStep`; without a machine the port need not be connected.
