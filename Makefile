@@ -37,7 +37,9 @@ lint: $(READY) ## style, types, and the direction of the rooms
 	$(RUN)/lint-imports
 
 bench: $(READY) ## the benchmarks
-	$(RUN)/drakerock bench
+	$(RUN)/python benchmarks/exploration.py speed
+	$(RUN)/python benchmarks/pile.py all
+	$(RUN)/python benchmarks/rocks.py all
 
 clean: ## remove the environment and the results
 	rm -rf $(VENV) out
