@@ -25,6 +25,51 @@ def _find_cell(value: float, origin: float, inverse_width: float, n_cells: int) 
 
 
 @kernel
+def find_region(awake: Array, others: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return the corners (3,) of the box around the boxes of awake rocks and of other bodies [m]."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for bodies in (awake, others):
+        for s in range(len(bodies)):
+            for d in range(3):
+                low[d] = min(low[d], lower[bodies[s], d])
+                high[d] = max(high[d], upper[bodies[s], d])
+    return low, high
+
+
+@kernel
+def find_near(
+    rocks: Array, positions: Array, low: Array, high: Array, reach: float, near: Array
+) -> tuple[int, Array, Array]:
+    """Find the rocks within reach of a box: only they need to be sorted into a grid.
+
+    Args:
+        rocks: (m,) indices.
+        positions: (n, 3) [m].
+        low, high: (3,) corners of the box [m].
+        reach: how far a rock reaches from its centre at most [m].
+        near: (m,) set.
+
+    Returns:
+        their number, and the corners (3,) of the box around their centres [m].
+    """
+    n_near = 0
+    first, last = np.full(3, np.inf), np.full(3, -np.inf)
+    for k in range(len(rocks)):
+        i = rocks[k]
+        inside = True
+        for d in range(3):
+            if not low[d] - reach < positions[i, d] < high[d] + reach:
+                inside = False
+        if inside:
+            near[n_near] = i
+            n_near += 1
+            for d in range(3):
+                first[d] = min(first[d], positions[i, d])
+                last[d] = max(last[d], positions[i, d])
+    return n_near, first, last
+
+
+@kernel
 def sort_into_grid(
     rocks: Array,
     positions: Array,
@@ -179,6 +224,36 @@ def find_static_pairs(
                     pair_b[n_pairs] = last_static + p
                 n_pairs += 1
     return n_pairs
+
+
+@kernel
+def find_stale(status: Array, quaternions: Array, positions: Array, posed: Array, stale: Array) -> int:
+    """Find the rocks whose pose has to be set: the awake ones, and all that are not where they were last.
+
+    Args:
+        status: (n,) AWAKE, RESTING, FIXED or LOST.
+        quaternions, positions: (n, 4), (n, 3) [m].
+        posed: (n, 7) poses of the last call; set.
+        stale: (n,) set: indices.
+
+    Returns:
+        their number.
+    """
+    n_stale = 0
+    for i in range(len(status)):
+        moved = status[i] == AWAKE
+        for d in range(4):
+            if posed[i, d] != quaternions[i, d]:
+                posed[i, d] = quaternions[i, d]
+                moved = True
+        for d in range(3):
+            if posed[i, 4 + d] != positions[i, d]:
+                posed[i, 4 + d] = positions[i, d]
+                moved = True
+        if moved:
+            stale[n_stale] = i
+            n_stale += 1
+    return n_stale
 
 
 @kernel
