@@ -28,6 +28,8 @@ from drakerock.pile.state import ContactMemory, PileState
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+# Rocks of one class of size by cells: items, boxes, origin, 1 / width, cells per axis, cell starts, reach.
+Grid = tuple[IntArray, Array, Array, float, IntArray, IntArray, float]
 _log = logging.getLogger(__name__)
 
 GRAVITY = 9.81
@@ -562,9 +564,7 @@ class NonsmoothEngine:
                 return n_pairs
             self._allocate_pairs(n_pairs + n_pairs // 4)
 
-    def _sort_grid(
-        self, rocks: IntArray, reach: float, low: Array, high: Array
-    ) -> tuple[IntArray, Array, float, IntArray, IntArray, float]:
+    def _sort_grid(self, rocks: IntArray, reach: float, low: Array, high: Array) -> Grid:
         """Sort the rocks of one class of size that are within reach of the box into a grid."""
         inverse_width = 1.0 / (1.3 * reach)
         n_near, first, last = broad_phase.find_near(rocks, self._positions, low, high, reach, self._near)
@@ -574,23 +574,25 @@ class NonsmoothEngine:
         n_cells = np.maximum(np.ceil(extent * inverse_width), 1).astype(np.int64)
         cell_start = np.empty(int(n_cells.prod()) + 1, np.int64)
         items = np.empty(len(rocks), np.int64)
+        boxes = np.empty((len(rocks), 6))
         broad_phase.sort_into_grid(
-            rocks, self._positions, origin, inverse_width, n_cells, cell_start, np.empty_like(items), items
-        )
-        return items, origin, inverse_width, n_cells, cell_start, reach
+            rocks, self._positions, self._lower, self._upper, origin, inverse_width, n_cells, cell_start,
+            np.empty_like(items), items, boxes,
+        )  # fmt: skip
+        return items, boxes, origin, inverse_width, n_cells, cell_start, reach
 
     def _search(
         self,
         seekers: IntArray,
         status: IntArray,
-        grid: tuple[IntArray, Array, float, IntArray, IntArray, float],
+        grid: Grid,
         n_pairs: int,
     ) -> int:
-        items, origin, inverse_width, n_cells, cell_start, reach = grid
+        items, boxes, origin, inverse_width, n_cells, cell_start, reach = grid
         return int(
             broad_phase.find_rock_pairs(
                 seekers, self.n_rocks, status, self._lower, self._upper, origin, inverse_width, n_cells,
-                cell_start, items, reach, self._pair_a, self._pair_b, n_pairs,
+                cell_start, items, boxes, reach, self._pair_a, self._pair_b, n_pairs,
             )
         )  # fmt: skip
 
