@@ -1,23 +1,28 @@
 """Does reduction, iterations or time step change the answer? Paired digs, stored as they finish.
 
     nice python benchmarks/faithfulness.py run 300 --seeds 40 --out build/faithfulness
+    nice python benchmarks/faithfulness.py cycles 300 --seeds 40 --out build/faithfulness
     python benchmarks/faithfulness.py table --out build/faithfulness
 
-Each seed is a place and depth of a dig, five to a pile (at full size all in one), dug once per variant. The table
-gives the mean paired difference against `none` (all awake) relative to its mean, with its 90 % confidence
-interval. Runs that are stored already are skipped, so a study can be stopped and continued.
+`run` digs by fixed motor rates; `cycles` plans and drives whole loading cycles of random strategies, which gives
+time, damage and debris too. Each seed is a place and depth of a dig, or a strategy; there are five to a pile (at full
+size all in one), and each is done once per variant. The table gives the mean paired difference against `none` (all
+awake) relative to its mean, with its 90 % confidence interval. Runs that are stored already are skipped, so a study
+can be stopped and continued.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from rocks import (
     ROCKS,
+    SHAPES,
     SITE,
     TIME_STEP,
     clear_way,
@@ -30,6 +35,9 @@ from scipy import stats
 
 from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
 from drakerock.dynamics.settling import PileRecipe, make_pile
+from drakerock.loading.config import LoadingConfig
+from drakerock.loading.cycle import run_cycle
+from drakerock.loading.scenario import Scenario
 from drakerock.pile.config import PileConfig, SiteConfig
 from drakerock.pile.state import PileState
 
@@ -39,6 +47,8 @@ SIZES = {
     "1000": (1000, SiteConfig(drift_width=6.5, void_depth=2.2, rear_layer=0.0), 6.0),
     "full": (0, SITE, 8.0),
 }
+# The method's ranges of the strategy.
+STRATEGY = {"alpha": (0.2, 2.0), "beta": (0.0, 1.0), "gamma": (0.0, 1.0), "kappa": (0.0, 1.0)}
 VARIANTS: dict[str, tuple[dict[str, object], float]] = {
     "none": ({"reduction": "none"}, TIME_STEP),
     "rest": ({"reduction": "rest"}, TIME_STEP),
@@ -51,6 +61,17 @@ VARIANTS: dict[str, tuple[dict[str, object], float]] = {
 }
 # Making a pile costs as much as several digs; each is at another place and depth.
 DIGS_PER_PILE = 5
+CYCLE_METRICS = (
+    "bucket_mass_kg",
+    "loading_time_s",
+    "peak_push_kN",
+    "mean_push_kN",
+    "displaced_m3",
+    "production_kg_s",
+    "damage",
+    "debris_kg",
+    "cpu_s",
+)
 METRICS = ("bucket_mass_kg", "peak_push_kN", "mean_push_kN", "displaced_m3", "reach_m", "cpu_s")
 
 
@@ -102,48 +123,110 @@ def run(size: str, seeds: range, variants: list[str], out: Path) -> None:
             print(size, seed, name, {k: round(result[k], 3) for k in METRICS}, flush=True)
 
 
+def run_cycles(size: str, seeds: range, variants: list[str], out: Path) -> None:
+    """Whole loading cycles, each of a strategy drawn from the method's ranges."""
+    out.mkdir(parents=True, exist_ok=True)
+    n, site, height = SIZES[size]
+    path = out / f"{size}-cycles.jsonl"
+    done = {(r["seed"], r["variant"]) for r in read(path)}
+    made = -1
+    for seed in seeds:
+        todo = [name for name in variants if (seed, name) not in done]
+        if not todo:
+            continue
+        rng = np.random.default_rng(2000 + seed)
+        strategy = dict(zip(STRATEGY, rng.uniform(*np.transpose(list(STRATEGY.values()))), strict=True))
+        number = 0 if size == "full" else seed // DIGS_PER_PILE
+        if number != made:
+            pile = get_pile() if size == "full" else make_small_pile(n, site, height, number)
+            made = number
+        for name in todo:
+            settings, time_step = VARIANTS[name]
+            contacts = replace(pile.contacts, resting=np.full(len(pile), settings["reduction"] == "rest"))
+            start = replace(pile, contacts=contacts, V_WRs=np.zeros((len(pile), 6)))
+            scenario = Scenario(
+                seed=seed,
+                site=site,
+                pile=PileConfig(rocks=n or None, emission_height=height),
+                dynamics=DynamicsConfig(nonsmooth=NonsmoothConfig(**settings), time_step=time_step),
+                loading=LoadingConfig(strategy=strategy),
+            )
+            cpu = time.process_time()
+            result = run_cycle(scenario, start)
+            cpu = time.process_time() - cpu
+            outcome = result.outcome
+            if outcome.loading_time_s is None or outcome.peak_push_force_N is None:
+                print(size, seed, name, outcome.reason)
+                values: dict[str, float] = {}
+            else:
+                after = result.pile_after
+                moved = np.linalg.norm(after.p_WRs - result.pile_before.p_WRs, axis=1) > 0.05
+                masses = start.calc_masses(np.array([shape.volume for shape in SHAPES]), ROCKS.density)
+                values = {
+                    "bucket_mass_kg": outcome.bucket_mass_kg,
+                    "loading_time_s": outcome.loading_time_s,
+                    "peak_push_kN": outcome.peak_push_force_N / 1e3,
+                    "mean_push_kN": outcome.mean_push_force_N / 1e3,
+                    "displaced_m3": float(masses[moved].sum() / ROCKS.density),
+                    "production_kg_s": outcome.objectives["production"],
+                    "damage": outcome.objectives["damage"],
+                    "debris_kg": outcome.objectives["debris"],
+                    "cpu_s": cpu,
+                }
+            with open(path, "a", encoding="utf-8") as file:
+                file.write(json.dumps({"seed": seed, "variant": name, **values}) + "\n")
+            print(size, seed, name, {k: round(v, 3) for k, v in values.items()}, flush=True)
+
+
 def read(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
 def print_table(out: Path, baseline: str = "none") -> None:
-    print("| rocks | variant | pairs | " + " | ".join(METRICS) + " |")
-    print("|---|---|---|" + "---|" * len(METRICS))
-    for size in SIZES:
-        results = {(r["variant"], r["seed"]): r for r in read(out / f"{size}.jsonl")}
-        for variant in VARIANTS:
-            if variant == baseline:
-                continue
-            seeds = [s for v, s in results if v == variant and (baseline, s) in results]
-            if len(seeds) < 3:
-                continue
-            cells = []
-            for metric in METRICS:
-                a = np.array([results[variant, s][metric] for s in seeds])
-                b = np.array([results[baseline, s][metric] for s in seeds])
-                mean = (a - b).mean() / b.mean()
-                half = stats.t.ppf(0.95, len(a) - 1) * (a - b).std(ddof=1) / np.sqrt(len(a)) / b.mean()
-                cells.append(f"{100 * mean:+.1f} ± {100 * half:.1f} %")
-            print(f"| {size} | {variant} | {len(seeds)} | " + " | ".join(cells) + " |")
+    """Print the tables of digs and of cycles; cycles that failed in either variant are left out."""
+    for suffix, metrics in (("", METRICS), ("-cycles", CYCLE_METRICS)):
+        print("| rocks | variant | pairs | " + " | ".join(metrics) + " |")
+        print("|---|---|---|" + "---|" * len(metrics))
+        for size in SIZES:
+            results = {
+                (r["variant"], r["seed"]): r for r in read(out / f"{size}{suffix}.jsonl") if "cpu_s" in r
+            }
+            for variant in VARIANTS:
+                if variant == baseline:
+                    continue
+                seeds = [s for v, s in results if v == variant and (baseline, s) in results]
+                if len(seeds) < 3:
+                    continue
+                cells = []
+                for metric in metrics:
+                    a = np.array([results[variant, s][metric] for s in seeds])
+                    b = np.array([results[baseline, s][metric] for s in seeds])
+                    mean = (a - b).mean() / b.mean()
+                    half = stats.t.ppf(0.95, len(a) - 1) * (a - b).std(ddof=1) / np.sqrt(len(a)) / b.mean()
+                    cells.append(f"{100 * mean:+.1f} ± {100 * half:.1f} %")
+                print(f"| {size} | {variant} | {len(seeds)} | " + " | ".join(cells) + " |")
+        print()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    one = commands.add_parser("run")
-    one.add_argument("size", choices=SIZES)
-    one.add_argument("--seeds", type=int, default=40)
-    one.add_argument("--first", type=int, default=0)
-    one.add_argument("--variants", nargs="+", choices=VARIANTS, default=["none", "rest"])
-    one.add_argument("--out", type=Path, default=Path("build/faithfulness"))
+    for name in ("run", "cycles"):
+        one = commands.add_parser(name)
+        one.add_argument("size", choices=SIZES)
+        one.add_argument("--seeds", type=int, default=40)
+        one.add_argument("--first", type=int, default=0)
+        one.add_argument("--variants", nargs="+", choices=VARIANTS, default=["none", "rest"])
+        one.add_argument("--out", type=Path, default=Path("build/faithfulness"))
     two = commands.add_parser("table")
     two.add_argument("--out", type=Path, default=Path("build/faithfulness"))
     arguments = parser.parse_args()
-    if arguments.command == "run":
-        seeds = range(arguments.first, arguments.first + arguments.seeds)
-        run(arguments.size, seeds, arguments.variants, arguments.out)
-    else:
+    if arguments.command == "table":
         print_table(arguments.out)
+    else:
+        seeds = range(arguments.first, arguments.first + arguments.seeds)
+        work = run if arguments.command == "run" else run_cycles
+        work(arguments.size, seeds, arguments.variants, arguments.out)
 
 
 if __name__ == "__main__":
