@@ -37,10 +37,12 @@ class Executor(ABC):
     Attributes:
         name: for people.
         dashboard: address of the Dask dashboard; "" if there is none.
+        local: its workers are other processes of this machine.
     """
 
     name: str
     dashboard: str = ""
+    local: bool = False
 
     @property
     @abstractmethod
@@ -110,6 +112,7 @@ class DaskExecutor(Executor):
         self._futures: dict[Any, Task] = {}
         self._n_workers, self._counted = 0, -1e9
         self._wanted = wanted
+        self.local = wanted > 0
 
     @property
     def n_workers(self) -> int:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from drakerock.dynamics.nonsmooth.compiling import are_kernels_compiled, describe_compilation
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.confirmation import Evaluate
 from drakerock.exploration.noise import calc_autocorrelation, calc_standard_error
@@ -127,6 +128,9 @@ class _Runner:
             self._display.say(f"running on {executor.name}, {executor.n_workers} workers")
             if executor.dashboard:
                 self._display.say(f"Dask dashboard: {executor.dashboard}")
+            nonsmooth = self._study.scenario.dynamics.rocks == "nonsmooth"
+            if executor.local and nonsmooth and self._work == RUN_SEQUENCE and not are_kernels_compiled():
+                self._display.say(describe_compilation())
 
     def _ask_to_stop(self) -> None:
         self._stop_file.touch()
