@@ -195,7 +195,7 @@ def machine_show(
 
     Example: drakerock machine show --out out/machine
     """
-    from drakerock.loading.cycle import make_folder
+    from drakerock.files import make_folder
     from drakerock.machine.page import write_machine_page
 
     make_folder(out)

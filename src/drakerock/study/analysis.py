@@ -23,6 +23,7 @@ from drakerock.exploration.problem import Problem, format_number
 from drakerock.exploration.strategy import Strategy, choose_strategy, parse_weights
 from drakerock.exploration.surrogate import fit_surrogate
 from drakerock.exploration.table import ResponseTable
+from drakerock.files import write_text
 from drakerock.study.store import DATABASE, export_tables
 
 _CONFIRMATION = "confirmation.json"
@@ -94,9 +95,7 @@ def run_confirm(source: str | Path, evaluate: Evaluate, n: int | None = None) ->
     confirmation = confirm_points(surrogate, front.X[chosen], evaluate)
     path = _find_folder(Path(source)) / _CONFIRMATION
     # Whole or not at all: a report may be made while this is written.
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(confirmation.to_rows(), indent=2) + "\n", encoding="utf-8")
-    part.replace(path)
+    write_text(path, json.dumps(confirmation.to_rows(), indent=2) + "\n")
     return confirmation
 
 
