@@ -17,8 +17,8 @@ class RestConfig(Config):
 
     displacement: Annotated[
         float, Field(gt=0, description="a rock rests when it moved less than this [m] ...")
-    ] = 0.004
-    time: Annotated[float, Field(gt=0, description="... within this time [s]")] = 0.3
+    ] = 0.001
+    time: Annotated[float, Field(gt=0, description="... within this time [s]")] = 0.1
     speed: Annotated[float, Field(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
     wake_load: Annotated[
         float,
@@ -27,7 +27,7 @@ class RestConfig(Config):
             description="it wakes when its contact impulses' sum has changed by this multiple of its weight's",
         ),
     ] = 1.0
-    wake_steps: Annotated[int, Field(ge=1, description="... for this many steps on end")] = 3
+    wake_steps: Annotated[int, Field(ge=1, description="... for this many steps on end")] = 1
     sensor_length: Annotated[
         float, Field(ge=0, le=10, description="rocks this far in front of the bucket are awake [m]")
     ] = 2.0
@@ -54,6 +54,12 @@ class NonsmoothConfig(Config):
             description="on Hertz's stiffness of two balls of the rocks' sieve widths, modulus and Poisson ratio",
         ),
     ] = 1.0
+    rolling_friction: Annotated[
+        float,
+        Field(
+            ge=0, le=0.2, description="a contact resists spin by this times its force and the pair's radius"
+        ),
+    ] = 0.01
     max_recovery_speed: Annotated[
         float, Field(gt=0, description="overlaps are pushed apart at most this fast [m/s]")
     ] = 1.0

@@ -44,46 +44,47 @@ def _hash(key: int, mask: int) -> int:
 
 
 @kernel
-def _is_idle(key: int, n_rocks: int, status: Array) -> bool:
-    """Return whether neither of a pair is awake: it is not searched, its points stay as they are."""
-    a, b = key // KEY_STEP, key % KEY_STEP
-    return status[a] != 0 and (b >= n_rocks or status[b] != 0)
-
-
-@kernel
-def index_memory(memory: Array, n_memory: int, n_rocks: int, status: Array, table: Array) -> int:
+def index_memory(
+    memory: Array, n_memory: int, n_rocks: int, status: Array, active: Array, table: Array
+) -> tuple[int, int]:
     """Set a hash table from a pair's key to the first of its rows in memory (rows of a pair are in line).
 
     Args:
         memory: (.., MEMORY_WIDTH).
         n_memory: number of rows.
         n_rocks: number of rocks.
-        status: (n,) of each rock, see `broad_phase`; pairs without an awake rock are left out.
+        status: (n,) of each rock, see `broad_phase`. A pair without an awake rock is idle: it is not searched, its
+            points stay as they are, and it is left out.
+        active: (.., ) scratch, as many as rows.
         table: (2**k,) at least twice as many places as rows; as many of the first as needed are set, -1 where
             empty.
 
     Returns:
-        how many places are in use: a power of two; look up in ``table[:places]``.
+        how many places are in use: a power of two; look up in ``table[:places]``. And the number of active rows.
     """
-    n_used = 0
+    n_active = 0
     for row in range(n_memory):
-        if not _is_idle(int(memory[row, MEMORY_KEY]), n_rocks, status):
-            n_used += 1
+        key = int(memory[row, MEMORY_KEY])
+        a, b = key // KEY_STEP, key % KEY_STEP
+        if status[a] == 0 or (b < n_rocks and status[b] == 0):
+            active[n_active] = row
+            n_active += 1
     places = 64
-    while places < 2 * n_used:
+    while places < 2 * n_active:
         places *= 2
     table[:places] = -1
     mask = places - 1
     last = -1
-    for row in range(n_memory):
+    for k in range(n_active):
+        row = active[k]
         key = int(memory[row, MEMORY_KEY])
-        if key != last and not _is_idle(key, n_rocks, status):
+        if key != last:
             place = _hash(key, mask)
             while table[place] >= 0:
                 place = (place + 1) & mask
             table[place] = row
         last = key
-    return places
+    return places, n_active
 
 
 @kernel
@@ -111,6 +112,8 @@ def write_memory(
     status: Array,
     old: Array,
     n_old: int,
+    active: Array,
+    n_active: int,
     rows: Array,
     n_rows: int,
     row_key: Array,
@@ -124,19 +127,22 @@ def write_memory(
         n_rocks: number of rocks.
         status: (n,) of each rock, see `broad_phase`; 0 is awake.
         old, n_old: memory of the last step and its length.
+        active, n_active: its rows that were looked up, see `index_memory`; the others are kept.
         rows, n_rows: contact rows after the solve.
         row_key, row_rock: per row the pair's key and its first rock.
         rotations: (n, 3, 3) of the rocks at the poses of the solve.
-        new: (capacity, MEMORY_WIDTH) set.
+        new: (capacity, MEMORY_WIDTH) set, zero beyond the last point.
 
     Returns:
         the number of points; beyond the capacity they are counted but lost.
     """
     n_new = 0
+    next_active = 0
     for row in range(n_old):
-        key = int(old[row, MEMORY_KEY])
-        if not _is_idle(key, n_rocks, status):
+        if next_active < n_active and active[next_active] == row:
+            next_active += 1
             continue
+        key = int(old[row, MEMORY_KEY])
         a, b = key // KEY_STEP, key % KEY_STEP
         if status[a] == 3 or (b < n_rocks and status[b] == 3):
             continue
@@ -162,6 +168,9 @@ def write_memory(
                     normal * row[NORMAL + d] + tangent_1 * row[TANGENT_1 + d] + tangent_2 * row[TANGENT_2 + d]
                 )
         n_new += 1
+    for k in range(n_new, len(new)):
+        for d in range(MEMORY_WIDTH):
+            new[k, d] = 0.0
     return n_new
 
 

@@ -28,6 +28,8 @@ from drakerock.pile.state import ContactMemory, PileState
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+# Rocks of one class of size by cells: items, boxes, origin, 1 / width, cells per axis, cell starts, reach.
+Grid = tuple[IntArray, Array, Array, float, IntArray, IntArray, float]
 _log = logging.getLogger(__name__)
 
 GRAVITY = 9.81
@@ -221,7 +223,7 @@ class NonsmoothEngine:
         self.inverse_inertia_local = np.ascontiguousarray(inverse.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
         self.radius = self.size * self.convex.radius[self.shape_index]
         self.curvature = np.zeros(n + 1 + n_machine_bodies)
-        self.curvature[:n] = 2.0 / self.size
+        self.curvature[:n] = 1.0 / self.size
         effective_modulus = 0.5 * rocks.elastic_modulus / (1.0 - rocks.poisson_ratio**2)
         self.hertz = config.stiffness_factor * 4.0 / 3.0 * effective_modulus
 
@@ -238,10 +240,13 @@ class NonsmoothEngine:
         self._upper = np.full((n_bodies, 3), -np.inf)
         self._inverse_inertia = np.zeros((n, 6))
         self._posed = np.full((n, 7), np.nan)
+        self._stale = np.zeros(n, np.int64)
+        self._near = np.zeros(n, np.int64)
         self._bodies = np.zeros((n + 1, solver.BODY_WIDTH))
         self._bodies_32 = np.zeros((n + 1, solver.BODY_WIDTH), np.float32)
         self._velocities = np.zeros((n + 1 + self.n_machine_bodies, 6))
         self._marks = np.zeros(n + 1 + self.n_machine_bodies, np.int64)
+        self._active = np.zeros(self.capacity, np.int64)
         self._table = np.zeros(1 << int(np.ceil(np.log2(2 * self.capacity))), np.int64)
         # Places for the pairs that are near but apart; what is pushed out is searched anew, no more.
         places = 1 << int(np.ceil(np.log2(max(16 * n, 1024))))
@@ -394,7 +399,7 @@ class NonsmoothEngine:
             SimulationFailure: the result is not finite, also when solved again more carefully.
         """
         for name in ("positions", "quaternions", "velocities"):
-            if not np.isfinite(getattr(arrays, name)).all():
+            if not motion.are_finite(getattr(arrays, name)):
                 raise SimulationFailure(f"rocks: {name} that are not finite")
         iterations = self.config.iterations
         new, report = self._try_step(arrays, machine, iterations, warm=True)
@@ -428,11 +433,13 @@ class NonsmoothEngine:
         awake = np.flatnonzero(status == AWAKE)
         self._velocities[:n] = arrays.velocities
         self._velocities[n + 1 :] = machine.arrays.jacobian @ machine.velocity
-        self._pose(arrays, machine, awake)
+        self._pose(arrays, machine, status)
         motion.set_bodies(awake, arrays.velocities, self.inverse_mass, self._inverse_inertia, self._bodies)
 
         n_pairs = self._find_pairs(status, awake)
-        places = contacts.index_memory(memory, arrays.n_memory, n, status, self._table)
+        places, n_active = contacts.index_memory(
+            memory, arrays.n_memory, n, status, self._active, self._table
+        )
         n_rows = self._find_contacts(n_pairs, memory, self._table[:places])
         rows, body_a, body_b = self._rows, self._body_a, self._body_b
         if not warm:
@@ -451,6 +458,10 @@ class NonsmoothEngine:
                 rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, dt,
                 config.impact_threshold, config.impact_iterations, self._marks, self._impacts,
             )  # fmt: skip
+        if config.rolling_friction > 0.0:
+            solver.resist_rolling(
+                rows, n_rows, body_a, body_b, self._bodies, n, self.curvature, config.rolling_friction
+            )
         motion.add_gravity(awake, self._bodies, np.array([0.0, 0.0, -self.gravity * dt]))
         velocity += machine.free_change
         residual = solver.solve_resting(
@@ -463,7 +474,7 @@ class NonsmoothEngine:
             arrays.positions.copy(),
             arrays.velocities.copy(),
             book,
-            np.zeros_like(arrays.memory),
+            np.empty_like(arrays.memory),
             0,
         )
         sane = motion.move(
@@ -481,8 +492,8 @@ class NonsmoothEngine:
             self._bodies_32[:] = 0.0
             return None, None
         n_memory = contacts.write_memory(
-            n, status, memory, arrays.n_memory, rows, n_rows, self._row_key, self._row_rock, self._rotations,
-            new.memory,
+            n, status, memory, arrays.n_memory, self._active, n_active, rows, n_rows, self._row_key,
+            self._row_rock, self._rotations, new.memory,
         )  # fmt: skip
         new.n_memory = min(n_memory, self.capacity)
         n_rested, n_lost = reduction.rest(
@@ -514,19 +525,18 @@ class NonsmoothEngine:
         )
         return new, report
 
-    def _pose(self, arrays: RockArrays, machine: MachineStep, awake: IntArray) -> None:
+    def _pose(self, arrays: RockArrays, machine: MachineStep, status: IntArray) -> None:
         """Set positions, rotations and boxes: of awake rocks, of others that were moved, of the machine."""
         n, dt, margin = self.n_rocks, self.time_step, self.config.contact_margin
         self._positions[:n] = arrays.positions
-        poses = np.hstack([arrays.quaternions, arrays.positions])
-        stale = (poses != self._posed).any(axis=1)
-        stale[awake] = True
+        n_stale = broad_phase.find_stale(
+            status, arrays.quaternions, arrays.positions, self._posed, self._stale
+        )
         broad_phase.calc_poses(
             self.shape, self.scale, arrays.quaternions, arrays.positions, arrays.velocities, dt, margin,
-            self.convex, np.flatnonzero(stale), self._rotations, self._lower, self._upper,
+            self.convex, self._stale[:n_stale], self._rotations, self._lower, self._upper,
             self.inverse_inertia_local, self._inverse_inertia,
         )  # fmt: skip
-        self._posed = poses
         broad_phase.calc_piece_boxes(
             self.first_piece, self.piece_body, self.shape, self.convex, machine.X_WBs,
             self._velocities[n + 1 :], dt, margin, self._positions, self._rotations, self._lower, self._upper,
@@ -535,7 +545,8 @@ class NonsmoothEngine:
     def _find_pairs(self, status: IntArray, awake: IntArray) -> int:
         n = self.n_rocks
         pieces = np.arange(self.first_piece, self.first_piece + len(self.piece_body))
-        grids = [self._sort_grid(rocks, reach) for rocks, reach in self._grids]
+        low, high = broad_phase.find_region(awake, pieces, self._lower, self._upper)
+        grids = [self._sort_grid(rocks, reach, low, high) for rocks, reach in self._grids]
         while True:
             n_pairs = 0
             for items, *_ in grids:
@@ -553,33 +564,35 @@ class NonsmoothEngine:
                 return n_pairs
             self._allocate_pairs(n_pairs + n_pairs // 4)
 
-    def _sort_grid(
-        self, rocks: IntArray, reach: float
-    ) -> tuple[IntArray, Array, float, IntArray, IntArray, float]:
+    def _sort_grid(self, rocks: IntArray, reach: float, low: Array, high: Array) -> Grid:
+        """Sort the rocks of one class of size that are within reach of the box into a grid."""
         inverse_width = 1.0 / (1.3 * reach)
-        positions = self._positions[rocks]
-        origin = np.maximum(positions.min(axis=0), self._lower_site)
-        extent = np.minimum(positions.max(axis=0), self._upper_site) - origin
+        n_near, first, last = broad_phase.find_near(rocks, self._positions, low, high, reach, self._near)
+        rocks = self._near[:n_near]
+        origin = np.maximum(first, self._lower_site)
+        extent = np.minimum(last, self._upper_site) - origin if n_near > 0 else np.zeros(3)
         n_cells = np.maximum(np.ceil(extent * inverse_width), 1).astype(np.int64)
         cell_start = np.empty(int(n_cells.prod()) + 1, np.int64)
         items = np.empty(len(rocks), np.int64)
+        boxes = np.empty((len(rocks), 6))
         broad_phase.sort_into_grid(
-            rocks, self._positions, origin, inverse_width, n_cells, cell_start, np.empty_like(items), items
-        )
-        return items, origin, inverse_width, n_cells, cell_start, reach
+            rocks, self._positions, self._lower, self._upper, origin, inverse_width, n_cells, cell_start,
+            np.empty_like(items), items, boxes,
+        )  # fmt: skip
+        return items, boxes, origin, inverse_width, n_cells, cell_start, reach
 
     def _search(
         self,
         seekers: IntArray,
         status: IntArray,
-        grid: tuple[IntArray, Array, float, IntArray, IntArray, float],
+        grid: Grid,
         n_pairs: int,
     ) -> int:
-        items, origin, inverse_width, n_cells, cell_start, reach = grid
+        items, boxes, origin, inverse_width, n_cells, cell_start, reach = grid
         return int(
             broad_phase.find_rock_pairs(
                 seekers, self.n_rocks, status, self._lower, self._upper, origin, inverse_width, n_cells,
-                cell_start, items, reach, self._pair_a, self._pair_b, n_pairs,
+                cell_start, items, boxes, reach, self._pair_a, self._pair_b, n_pairs,
             )
         )  # fmt: skip
 

@@ -15,6 +15,17 @@ HUGE = 1e9
 
 
 @kernel
+def are_finite(values: Array) -> bool:
+    """Return whether all values of a matrix are finite, and none is absurdly large."""
+    for i in range(values.shape[0]):
+        for d in range(values.shape[1]):
+            # Not math.isfinite: with sums reordered it is compiled to True.
+            if not abs(values[i, d]) < HUGE:
+                return False
+    return True
+
+
+@kernel
 def turn(
     w: float, x: float, y: float, z: float, ax: float, ay: float, az: float
 ) -> tuple[float, float, float, float]:

@@ -211,7 +211,7 @@ def test_distance_agrees_with_scene_graph(seed):
         assert ours >= pair.distance - 1e-3
 
 
-def calc_manifold(shapes, r_a, r_b, p, max_gap=0.005, scale_b=1.0):
+def calc_manifold(shapes, r_a, r_b, p, max_gap=0.005, scale_b=1.0, known=()):
     status, *v, ax, ay, az = calc_core_distance(
         shapes,
         0,
@@ -233,7 +233,8 @@ def calc_manifold(shapes, r_a, r_b, p, max_gap=0.005, scale_b=1.0):
     points[0] = [*(np.array([ax, ay, az]) + n * (shapes.rounding[0] + 0.5 * gap)), gap]
     count = make_manifold(
         shapes, 0, 1.0, flat(r_a), 1, scale_b, flat(r_b), *map(float, p), *map(float, n),
-        max(max_gap, gap), 0.985, points, make_manifold_workspace(),
+        max(max_gap, gap), 0.985, np.array(known, float).reshape(-1, 3), len(known), points,
+        make_manifold_workspace(),
     )  # fmt: skip
     return n, points[:count]
 
@@ -251,6 +252,29 @@ def test_box_on_box_rests_on_four_points():
     expected = {(x + 0.1, y - 0.05) for x in (-0.235, 0.235) for y in (-0.235, 0.235)}
     for x, y in expected:
         assert np.linalg.norm(points[:, :2] - [x, y], axis=1).min() < 1e-6
+
+
+def test_points_of_the_last_step_are_kept():
+    """A plate with bevelled corners, tilted a hair to and fro: the choice by depth alone would jump."""
+    corners = [(x, y) for a, b in ((0.25, 0.22), (0.22, 0.25)) for x in (-a, a) for y in (-b, b)]
+    plate = np.array([[x, y, z] for x, y in corners for z in (-0.1, 0.1)])
+    shapes = make_convex_shapes([BOX, plate], [0.03, 0.01])
+    p = np.array([0.0, 0.0, 0.599])
+
+    def find(*tilt, known=()):
+        r_b = Rotation.from_euler("xy", tilt).as_matrix()
+        return calc_manifold(shapes, np.eye(3), r_b, p, known=known)[1]
+
+    def find_jump(one, two):
+        return np.linalg.norm(one[:, None, :3] - two[None, :, :3], axis=2).min(axis=1).max()
+
+    first = find(1e-4, 1.1e-4)
+    assert len(first) == 4
+    assert find_jump(first, find(1.1e-4, 1e-4)) > 0.01
+    assert find_jump(first, find(1.1e-4, 1e-4, known=first[:, :3])) < 1e-3
+    # A corner that is clearly deeper is the first point all the same.
+    deepest = find(0.02, 0.001)[0]
+    np.testing.assert_allclose(find(0.02, 0.001, known=first[:, :3])[0], deepest)
 
 
 def test_overlapping_faces_keep_their_gaps():

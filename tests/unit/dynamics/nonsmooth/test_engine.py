@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
@@ -14,14 +15,23 @@ from scipy.spatial.transform import Rotation
 
 from drakerock.dynamics.config import NonsmoothConfig, RestConfig
 from drakerock.dynamics.interface import ROCK_SUMMARY
-from drakerock.dynamics.nonsmooth import contacts, motion, reduction
+from drakerock.dynamics.nonsmooth import contacts, motion, reduction, solver
 from drakerock.dynamics.nonsmooth.engine import make_machineless_step
 from drakerock.dynamics.nonsmooth.system import NonsmoothRocks
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.pile.config import RocksConfig
 from drakerock.pile.shapes import load_rock_shapes
 from drakerock.pile.state import load_pile, save_pile
-from rock_helpers import draw_quaternion, make_ball, make_box, make_engine, make_pile, make_plane_site, run
+from rock_helpers import (
+    draw_quaternion,
+    make_ball,
+    make_box,
+    make_engine,
+    make_pile,
+    make_plane_site,
+    make_shape,
+    run,
+)
 
 SHAPES = load_rock_shapes(RocksConfig().shapes)
 
@@ -46,7 +56,7 @@ def test_broad_phase_finds_every_pair_of_boxes_that_meet(seed):
     arrays.book[rng.random(len(pile)) < 0.4, reduction.STATUS] = 1  # some at rest
     status = arrays.book[:, reduction.STATUS].astype(np.int64)
     awake = np.flatnonzero(status == 0)
-    engine._pose(arrays, make_machineless_step(), awake)
+    engine._pose(arrays, make_machineless_step(), status)
     n_pairs = engine._find_pairs(status, awake)
     found = [
         (int(a), int(b)) for a, b in zip(engine._pair_a[:n_pairs], engine._pair_b[:n_pairs], strict=True)
@@ -127,14 +137,14 @@ def test_contact_memory_is_found_again():
     contacts.sum_impulses(arrays.memory, arrays.n_memory, 1, sums)
     np.testing.assert_allclose(sums[0], [0, 0, engine.mass[0] * 9.81 * 0.01], rtol=1e-4, atol=1e-6)
     table = np.zeros(128, np.int64)
-    status = np.zeros(1, np.int64)
-    assert contacts.index_memory(arrays.memory, arrays.n_memory, 1, status, table) == 64
+    status, active = np.zeros(1, np.int64), np.zeros(8, np.int64)
+    assert contacts.index_memory(arrays.memory, arrays.n_memory, 1, status, active, table) == (64, 4)
     table = table[:64]
     key = int(arrays.memory[0, contacts.MEMORY_KEY])
     assert contacts.find_in_memory(key, arrays.memory, table) == 0
     assert contacts.find_in_memory(key + 1, arrays.memory, table) == -1
     # pairs without an awake rock are not searched
-    contacts.index_memory(arrays.memory, arrays.n_memory, 1, status + 1, table)
+    assert contacts.index_memory(arrays.memory, arrays.n_memory, 1, status + 1, active, table) == (64, 0)
     assert contacts.find_in_memory(key, arrays.memory, table) == -1
 
 
@@ -338,3 +348,59 @@ def test_the_system_runs_without_a_machine_and_steps_as_the_engine_does():
     assert summary[list(ROCK_SUMMARY).index("n_awake")] == len(pile)
     assert not system.GetOutputPort("F_B_W").Eval(simulator.get_context()).any()
     assert not system.GetOutputPort("rock_status").Eval(simulator.get_context()).any()
+
+
+@given(
+    spins=st.lists(st.floats(-5, 5), min_size=6, max_size=6),
+    load=st.floats(0.1, 1e4),
+    fixed=st.booleans(),
+)
+def test_rolling_friction_slows_and_keeps_angular_momentum(spins, load, fixed):
+    """Two rocks with one contact, or a rock on the floor: at most c N r of torque, never turned round."""
+    bodies = np.zeros((3, solver.BODY_WIDTH))
+    inertia = np.array([[2.0, 0.3, -0.1, 3.0, 0.2, 4.0], [1.0, 0.1, 0.2, 1.5, -0.1, 2.0]])
+    bodies[:2, solver.INVERSE_INERTIA : solver.INVERSE_INERTIA + 6] = inertia
+    bodies[:2, :3] = np.reshape(spins, (2, 3))
+    rows = np.zeros((1, contacts.ROW_WIDTH))
+    rows[0, contacts.IMPULSE] = load
+    a, b = np.array([0]), np.array([2 if fixed else 1])
+    before = bodies.copy()
+    solver.resist_rolling(rows, 1, a, b, bodies, 2, np.array([2.0, 3.0, 0.0]), 0.01)
+
+    def unfold(m):
+        return np.linalg.inv(np.array([[m[0], m[1], m[2]], [m[1], m[3], m[4]], [m[2], m[4], m[5]]]))
+
+    twist = [unfold(inertia[k]) @ (bodies[k, :3] - before[k, :3]) for k in range(2)]
+    limit = 0.01 * load / (2.0 if fixed else 5.0)
+    assert np.linalg.norm(twist[0]) <= limit * (1 + 1e-9)
+    if not fixed:
+        np.testing.assert_allclose(twist[0], -twist[1], atol=1e-9 * (1 + limit))
+    old, new = before[b[0], :3] - before[0, :3], bodies[b[0], :3] - bodies[0, :3]
+    assert new @ old >= -1e-9
+    energies = [0.5 * v[k, :3] @ unfold(inertia[k]) @ v[k, :3] for v in (before, bodies) for k in range(2)]
+    assert sum(energies[2:]) <= sum(energies[:2]) + 1e-9
+    np.testing.assert_array_equal(bodies[2], 0.0)
+
+
+def test_rolling_friction_stops_a_rock_that_swings_on_two_points():
+    """A spindle hangs by its tips between two posts: a pendulum, for ever if nothing resists."""
+    tips = [[0, -0.7, 0.2], [0, 0.7, 0.2], [0, 0, -0.3], [-0.25, 0, 0.1], [0.25, 0, 0.1]]
+    spindle = make_shape(trimesh.Trimesh(tips, trimesh.convex.convex_hull(np.array(tips)).faces))
+    pile = make_pile(
+        [[0, -0.8, 0.25], [0, 0.8, 0.25], [0, 0, 0.45]], shape=[0, 0, 1], fixed=[True, True, False]
+    )
+    swings = {}
+    for coefficient in (0.0, 0.01):
+        config = NonsmoothConfig(rolling_friction=coefficient, reduction="none")
+        engine = make_engine(pile, [make_box(0.5, 0.4, 0.5), spindle], config=config)
+        arrays, _ = run(engine, engine.make_arrays(pile), 1.0)
+        arrays.velocities[2, 1] = 0.3
+        arrays, _ = run(engine, arrays, 4.0)
+        spins = []
+        for _ in range(150):
+            arrays, _ = engine.advance(arrays)
+            spins.append(abs(arrays.velocities[2, 1]))
+        assert arrays.positions[2, 2] > 0.3
+        swings[coefficient] = max(spins)
+    assert swings[0.0] > 0.1
+    assert swings[0.01] < 0.01

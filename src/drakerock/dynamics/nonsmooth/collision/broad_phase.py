@@ -25,27 +25,77 @@ def _find_cell(value: float, origin: float, inverse_width: float, n_cells: int) 
 
 
 @kernel
+def find_region(awake: Array, others: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return the corners (3,) of the box around the boxes of awake rocks and of other bodies [m]."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for bodies in (awake, others):
+        for s in range(len(bodies)):
+            for d in range(3):
+                low[d] = min(low[d], lower[bodies[s], d])
+                high[d] = max(high[d], upper[bodies[s], d])
+    return low, high
+
+
+@kernel
+def find_near(
+    rocks: Array, positions: Array, low: Array, high: Array, reach: float, near: Array
+) -> tuple[int, Array, Array]:
+    """Find the rocks within reach of a box: only they need to be sorted into a grid.
+
+    Args:
+        rocks: (m,) indices.
+        positions: (n, 3) [m].
+        low, high: (3,) corners of the box [m].
+        reach: how far a rock reaches from its centre at most [m].
+        near: (m,) set.
+
+    Returns:
+        their number, and the corners (3,) of the box around their centres [m].
+    """
+    n_near = 0
+    first, last = np.full(3, np.inf), np.full(3, -np.inf)
+    for k in range(len(rocks)):
+        i = rocks[k]
+        inside = True
+        for d in range(3):
+            if not low[d] - reach < positions[i, d] < high[d] + reach:
+                inside = False
+        if inside:
+            near[n_near] = i
+            n_near += 1
+            for d in range(3):
+                first[d] = min(first[d], positions[i, d])
+                last[d] = max(last[d], positions[i, d])
+    return n_near, first, last
+
+
+@kernel
 def sort_into_grid(
     rocks: Array,
     positions: Array,
+    lower: Array,
+    upper: Array,
     origin: Array,
     inverse_width: float,
     n_cells: Array,
     cell_start: Array,
     cells: Array,
     items: Array,
+    boxes: Array,
 ) -> None:
     """Sort rocks by grid cell (counting sort, stable).
 
     Args:
         rocks: (m,) indices.
         positions: (n, 3) [m].
+        lower, upper: (bodies, 3) bounding boxes, margins included [m].
         origin: (3,) corner of the grid [m]; rocks outside count to the cells at its border.
         inverse_width: of a cell [1/m].
         n_cells: (3,).
         cell_start: (number of cells + 1,) set: where a cell's rocks start in `items`; z runs fastest.
         cells: (m,) scratch.
         items: (m,) set: the rocks in the order of their cells.
+        boxes: (m, 6) set: their bounding boxes in the same order, so that a search reads memory in line.
     """
     nx, ny, nz = n_cells[0], n_cells[1], n_cells[2]
     n_all = nx * ny * nz
@@ -66,6 +116,10 @@ def sort_into_grid(
     for c in range(n_all):
         cell_start[c] = cell_start[c + 1]
     cell_start[n_all] = len(rocks)
+    for k in range(len(rocks)):
+        for d in range(3):
+            boxes[k, d] = lower[items[k], d]
+            boxes[k, 3 + d] = upper[items[k], d]
 
 
 @kernel
@@ -92,6 +146,7 @@ def find_rock_pairs(
     n_cells: Array,
     cell_start: Array,
     items: Array,
+    boxes: Array,
     reach: float,
     pair_a: Array,
     pair_b: Array,
@@ -104,7 +159,7 @@ def find_rock_pairs(
         n_rocks: number of rocks.
         status: (n,) AWAKE, RESTING, FIXED or LOST.
         lower, upper: (bodies, 3) bounding boxes, margins included [m].
-        origin, inverse_width, n_cells, cell_start, items: of the grid, see `sort_into_grid`.
+        origin, inverse_width, n_cells, cell_start, items, boxes: of the grid, see `sort_into_grid`.
         reach: how far a rock of this grid reaches from its centre at most [m].
         pair_a, pair_b: set; the rock with the lower index comes first, a machine body always second.
         n_pairs: number of pairs so far.
@@ -115,6 +170,8 @@ def find_rock_pairs(
     nx, ny, nz = n_cells[0], n_cells[1], n_cells[2]
     for s in range(len(seekers)):
         i = seekers[s]
+        low_x, low_y, low_z = lower[i, 0], lower[i, 1], lower[i, 2]
+        high_x, high_y, high_z = upper[i, 0], upper[i, 1], upper[i, 2]
         x0 = _find_cell(lower[i, 0] - reach, origin[0], inverse_width, nx)
         x1 = _find_cell(upper[i, 0] + reach, origin[0], inverse_width, nx)
         y0 = _find_cell(lower[i, 1] - reach, origin[1], inverse_width, ny)
@@ -125,8 +182,17 @@ def find_rock_pairs(
             for cy in range(y0, y1 + 1):
                 column = (cx * ny + cy) * nz
                 for k in range(cell_start[column + z0], cell_start[column + z1 + 1]):
+                    if (
+                        boxes[k, 0] >= high_x
+                        or boxes[k, 3] <= low_x
+                        or boxes[k, 1] >= high_y
+                        or boxes[k, 4] <= low_y
+                        or boxes[k, 2] >= high_z
+                        or boxes[k, 5] <= low_z
+                    ):
+                        continue
                     j = items[k]
-                    if not _boxes_meet(lower, upper, i, j) or j == i or status[j] == LOST:
+                    if j == i or status[j] == LOST:
                         continue
                     # Two awake rocks find each other twice.
                     if i < n_rocks and status[j] == AWAKE and i > j:
@@ -179,6 +245,36 @@ def find_static_pairs(
                     pair_b[n_pairs] = last_static + p
                 n_pairs += 1
     return n_pairs
+
+
+@kernel
+def find_stale(status: Array, quaternions: Array, positions: Array, posed: Array, stale: Array) -> int:
+    """Find the rocks whose pose has to be set: the awake ones, and all that are not where they were last.
+
+    Args:
+        status: (n,) AWAKE, RESTING, FIXED or LOST.
+        quaternions, positions: (n, 4), (n, 3) [m].
+        posed: (n, 7) poses of the last call; set.
+        stale: (n,) set: indices.
+
+    Returns:
+        their number.
+    """
+    n_stale = 0
+    for i in range(len(status)):
+        moved = status[i] == AWAKE
+        for d in range(4):
+            if posed[i, d] != quaternions[i, d]:
+                posed[i, d] = quaternions[i, d]
+                moved = True
+        for d in range(3):
+            if posed[i, 4 + d] != positions[i, d]:
+                posed[i, 4 + d] = positions[i, d]
+                moved = True
+        if moved:
+            stale[n_stale] = i
+            n_stale += 1
+    return n_stale
 
 
 @kernel

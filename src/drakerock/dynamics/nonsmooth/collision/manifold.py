@@ -2,7 +2,9 @@
 
 The face of one body that points best along the normal is the reference; the other body's face is clipped
 against the reference's sides (Sutherland and Hodgman) and the corners that remain, with their gaps, are
-thinned to four points that are far apart.
+thinned to four points that are far apart. Corners that carried load in the last step are preferred: faces that
+touch have many corners of nearly the same depth, and a choice by depth alone changes from step to step, which
+shakes the pile.
 """
 
 from __future__ import annotations
@@ -15,12 +17,25 @@ from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, kernel
 
 MAX_OUTLINE = 96
 MAX_POINTS = 4
+# A corner is a known point of the last step if this near to it [radius of the smaller body].
+KNOWN_DISTANCE = 0.03
+# By how much a corner has to be deeper than a known one to be the first point instead [m].
+KNOWN_DEPTH = 3e-4
+# By how much farther, squared, it has to be from the points chosen already.
+KNOWN_FACTOR = 2.0
+# Columns of a candidate: position, gap, 1 if known.
+KNOWN = 4
+CANDIDATE_WIDTH = 5
 
 
 @kernel
 def make_manifold_workspace() -> tuple[Array, Array, Array]:
-    """Return (outline, clipped, candidates): two outlines (MAX_OUTLINE, 3) and points with gaps (.., 4)."""
-    return np.zeros((MAX_OUTLINE, 3)), np.zeros((MAX_OUTLINE, 3)), np.zeros((MAX_OUTLINE, 4))
+    """Return (outline, clipped, candidates): two outlines (MAX_OUTLINE, 3), (MAX_OUTLINE, CANDIDATE_WIDTH)."""
+    return (
+        np.zeros((MAX_OUTLINE, 3)),
+        np.zeros((MAX_OUTLINE, 3)),
+        np.zeros((MAX_OUTLINE, CANDIDATE_WIDTH)),
+    )
 
 
 @kernel
@@ -78,15 +93,41 @@ def _clip(
 
 
 @kernel
+def find_first_point(candidates: Array, n_candidates: int, known: Array, n_known: int, radius: float) -> int:
+    """Mark the known candidates; return the deepest, a known one if it is nearly as deep.
+
+    Args:
+        candidates, n_candidates: corners with gaps; column KNOWN is set.
+        known, n_known: (.., 3) points that carried load in the last step.
+        radius: of the smaller body [m].
+    """
+    first = 0
+    least = np.inf
+    for k in range(n_candidates):
+        nearest2 = np.inf
+        for j in range(n_known):
+            dx = candidates[k, 0] - known[j, 0]
+            dy = candidates[k, 1] - known[j, 1]
+            dz = candidates[k, 2] - known[j, 2]
+            nearest2 = min(nearest2, dx * dx + dy * dy + dz * dz)
+        candidates[k, KNOWN] = 1.0 if nearest2 < (KNOWN_DISTANCE * radius) ** 2 else 0.0
+        gap = candidates[k, 3] - KNOWN_DEPTH * candidates[k, KNOWN]
+        if gap < least:
+            least = gap
+            first = k
+    return first
+
+
+@kernel
 def add_spread_points(
     candidates: Array, n_candidates: int, points: Array, n_points: int, min_distance: float
 ) -> int:
     """Add to the manifold `points` (4, 4) those candidates that are farthest from the points it has.
 
-    Returns the number of points.
+    Known candidates go before others that are not much farther. Returns the number of points.
     """
     while n_points < MAX_POINTS:
-        best = min_distance * min_distance
+        best = 0.0
         chosen = -1
         for k in range(n_candidates):
             nearest2 = np.inf
@@ -95,8 +136,9 @@ def add_spread_points(
                 dy = candidates[k, 1] - points[j, 1]
                 dz = candidates[k, 2] - points[j, 2]
                 nearest2 = min(nearest2, dx * dx + dy * dy + dz * dz)
-            if nearest2 > best:
-                best = nearest2
+            factor = KNOWN_FACTOR if candidates[k, KNOWN] > 0.0 else 1.0
+            if nearest2 > min_distance * min_distance / factor and factor * nearest2 > best:
+                best = factor * nearest2
                 chosen = k
         if chosen < 0:
             break
@@ -123,6 +165,8 @@ def make_manifold(
     nz: float,
     max_gap: float,
     min_cosine: float,
+    known: Array,
+    n_known: int,
     points: Array,
     workspace: tuple[Array, Array, Array],
 ) -> int:
@@ -133,6 +177,7 @@ def make_manifold(
         nx, ny, nz: unit normal from A to B.
         max_gap: points farther apart than this are left out [m].
         min_cosine: a face belongs to the contact if its normal is within this cosine of the pair's.
+        known, n_known: (.., 3) points of the last step that carried load, from A's origin.
         points: (4, 4) positions (half way between the surfaces, from A's origin) and gaps; row 0 holds the
             nearest point on entry, rows 1 to 3 are set.
         workspace: from `make_manifold_workspace`.
@@ -180,7 +225,6 @@ def make_manifold(
     # Gaps are measured along the pair's normal, between the incident corner and the reference's plane.
     along = sign * (fx * nx + fy * ny + fz * nz)
     n_candidates = 0
-    deepest = -1
     for k in range(n_outline):
         x, y, z = outline[k, 0], outline[k, 1], outline[k, 2]
         gap = ((x - ax) * fx + (y - ay) * fy + (z - az) * fz) / along - roundings
@@ -190,14 +234,14 @@ def make_manifold(
             candidates[n_candidates, 1] = y + shift * ny
             candidates[n_candidates, 2] = z + shift * nz
             candidates[n_candidates, 3] = gap
-            if deepest < 0 or gap < candidates[deepest, 3]:
-                deepest = n_candidates
             n_candidates += 1
     if n_candidates == 0:
         return 1
-    # Where a face carries, its corners do; the nearest point, which wanders over parallel faces, is dropped.
-    if n_candidates >= 3 and candidates[deepest, 3] < points[0, 3] + 1e-3:
+    radius = min(scale_a * shapes.radius[shape_a], scale_b * shapes.radius[shape_b])
+    first = find_first_point(candidates, n_candidates, known, n_known, radius)
+    # Where a face or an edge carries, its corners do; the nearest point, which wanders over them, is dropped.
+    if n_candidates >= 2 and candidates[first, 3] < points[0, 3] + 1e-3:
         for d in range(4):
-            points[0, d] = candidates[deepest, d]
-    spread = 0.2 * min(scale_a * shapes.radius[shape_a], scale_b * shapes.radius[shape_b])
+            points[0, d] = candidates[first, d]
+    spread = 0.2 * radius
     return add_spread_points(candidates, n_candidates, points, 1, spread)

@@ -11,6 +11,7 @@ from drakerock.dynamics.nonsmooth.collision.geometry import (
     get_corner,
     get_rotation,
     make_tangents,
+    rotate,
     rotate_back,
 )
 from drakerock.dynamics.nonsmooth.collision.gjk import (
@@ -20,8 +21,10 @@ from drakerock.dynamics.nonsmooth.collision.gjk import (
     make_gjk_workspace,
 )
 from drakerock.dynamics.nonsmooth.collision.manifold import (
+    KNOWN,
     MAX_POINTS,
     add_spread_points,
+    find_first_point,
     make_manifold,
     make_manifold_workspace,
 )
@@ -63,6 +66,8 @@ def _find_plane_points(
     z: float,
     plane: Array,
     max_gap: float,
+    known: Array,
+    n_known: int,
     points: Array,
     candidates: Array,
 ) -> int:
@@ -71,7 +76,6 @@ def _find_plane_points(
     height = plane[0] * x + plane[1] * y + plane[2] * z - plane[3] - rounding
     lx, ly, lz = rotate_back(r, plane[0], plane[1], plane[2])
     n_candidates = 0
-    deepest = 0
     for k in range(shapes.vertex_start[shape], shapes.vertex_start[shape + 1]):
         along = lx * shapes.vertices[k, 0] + ly * shapes.vertices[k, 1] + lz * shapes.vertices[k, 2]
         gap = height + scale * along
@@ -82,14 +86,14 @@ def _find_plane_points(
             candidates[n_candidates, 1] = cy - shift * plane[1]
             candidates[n_candidates, 2] = cz - shift * plane[2]
             candidates[n_candidates, 3] = gap
-            if gap < candidates[deepest, 3]:
-                deepest = n_candidates
             n_candidates += 1
     if n_candidates == 0:
         return 0
+    radius = scale * shapes.radius[shape]
+    first = find_first_point(candidates, n_candidates, known, n_known, radius)
     for d in range(4):
-        points[0, d] = candidates[deepest, d]
-    return add_spread_points(candidates, n_candidates, points, 1, 0.2 * scale * shapes.radius[shape])
+        points[0, d] = candidates[first, d]
+    return add_spread_points(candidates, n_candidates, points, 1, 0.2 * radius)
 
 
 @kernel
@@ -123,6 +127,7 @@ def _add_fast_points(
             candidates[n_candidates, 1] = cy + shift * ny
             candidates[n_candidates, 2] = cz + shift * nz
             candidates[n_candidates, 3] = gap
+            candidates[n_candidates, KNOWN] = 0.0
             n_candidates += 1
     return add_spread_points(candidates, n_candidates, points, n_points, 0.2 * scale * shapes.radius[shape])
 
@@ -190,6 +195,7 @@ def find_contacts(
     gjk_workspace = make_gjk_workspace()
     manifold_workspace = make_manifold_workspace()
     points = np.zeros((MAX_POINTS, 4))
+    known_points = np.zeros((MAX_POINTS, 3))
     n_rows = 0
     statistics[:] = 0
     for pair in range(n_pairs):
@@ -204,12 +210,30 @@ def find_contacts(
         spin_a = math.sqrt(velocities[a, 0] ** 2 + velocities[a, 1] ** 2 + velocities[a, 2] ** 2)
         reach = math.sqrt(speed2) + spin_a * scale_a * shapes.radius[shape_a]
         remembered = find_in_memory(key, memory, table)
+        # The direction in which the pair pushed last starts the search; where it did is preferred.
+        hx, hy, hz = 0.0, 0.0, 0.0
+        n_known = 0
+        if remembered >= 0:
+            row = remembered
+            while row < len(memory) and int(memory[row, MEMORY_KEY]) == key:
+                hx += memory[row, MEMORY_IMPULSE]
+                hy += memory[row, MEMORY_IMPULSE + 1]
+                hz += memory[row, MEMORY_IMPULSE + 2]
+                if n_known < MAX_POINTS:
+                    known_points[n_known, 0], known_points[n_known, 1], known_points[n_known, 2] = rotate(
+                        r_a,
+                        memory[row, MEMORY_POINT],
+                        memory[row, MEMORY_POINT + 1],
+                        memory[row, MEMORY_POINT + 2],
+                    )
+                    n_known += 1
+                row += 1
         if first_plane <= b < first_piece:
             plane = planes[b - first_plane]
             nx, ny, nz = -plane[0], -plane[1], -plane[2]
             n_points = _find_plane_points(
                 shapes, shape_a, scale_a, r_a, positions[a, 0], positions[a, 1], positions[a, 2], plane,
-                margin + time_step * reach, points, manifold_workspace[2],
+                margin + time_step * reach, known_points, n_known, points, manifold_workspace[2],
             )  # fmt: skip
             if n_points == 0:
                 continue
@@ -241,15 +265,6 @@ def find_contacts(
                 if along > 0.0 and along * along > limit * limit * (gx * gx + gy * gy + gz * gz):
                     statistics[0] += 1
                     continue
-            # The direction in which the pair pushed last starts the search.
-            hx, hy, hz = 0.0, 0.0, 0.0
-            if remembered >= 0:
-                row = remembered
-                while row < len(memory) and int(memory[row, MEMORY_KEY]) == key:
-                    hx += memory[row, MEMORY_IMPULSE]
-                    hy += memory[row, MEMORY_IMPULSE + 1]
-                    hz += memory[row, MEMORY_IMPULSE + 2]
-                    row += 1
             length = math.sqrt(hx * hx + hy * hy + hz * hz)
             if length > 0.0:
                 hx, hy, hz = hx / length, hy / length, hz / length
@@ -282,7 +297,7 @@ def find_contacts(
             points[0, 3] = gap
             n_points = make_manifold(
                 shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, nx, ny, nz,
-                max(manifold_gap, gap), face_cosine, points, manifold_workspace,
+                max(manifold_gap, gap), face_cosine, known_points, n_known, points, manifold_workspace,
             )  # fmt: skip
             if b >= n_rocks and time_step * reach > FAST:
                 offset = nx * ax + ny * ay + nz * az + distance - scale_b * shapes.rounding[shape_b]
