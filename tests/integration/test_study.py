@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from drakerock.config import calc_config_hash
@@ -88,8 +89,11 @@ def test_controller_and_machine_parameters_act_on_a_real_study(tmp_path):
     assert status["cycles"]["failed"] == 0
     table = ResponseTable.load(tmp_path)
     assert table.problem.objective_names == ("production", "damage", "specific_energy")
-    assert np.isfinite(table.Y).all()
-    assert (table.Y[0, [0, 2]] != table.Y[1, [0, 2]]).all()  # so few rocks do no damage
+    # So few rocks may leave the bucket empty, and then there is no energy per tonne.
+    assert np.isfinite(table.Y[:, :2]).all()
+    energies = pq.read_table(tmp_path / "loadings.parquet")["energy_J"].to_pylist()
+    assert len(set(energies)) == 2
+    assert min(energies) > 0.0
     for point, x in zip(table.point, table.X, strict=True):
         outcome = json.loads((tmp_path / f"points/{point}/attempt_0/loading_00/outcome.json").read_text())
         assert outcome["strategy"] == study.scenario.loading.strategy.model_dump()  # the dig strategy is held
