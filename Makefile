@@ -11,7 +11,7 @@ READY = $(VENV)/.ready
 export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
-.PHONY: help demo test test-slow lint bench clean
+.PHONY: help demo smoke test test-slow lint bench clean
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
@@ -23,6 +23,10 @@ $(READY): pyproject.toml constraints.txt
 
 demo: $(READY) ## one loading cycle with its replay, into out/demo
 	$(RUN)/drakerock load studies/demo.yaml --out out/demo
+
+smoke: $(READY) ## the smallest study, from the first loading to the report, into out/smoke
+	$(RUN)/drakerock study run studies/smoke.yaml --out out/smoke
+	$(RUN)/drakerock study report out/smoke
 
 test: $(READY) ## the test suite
 	$(RUN)/python -m pytest -n auto

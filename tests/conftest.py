@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
 import tempfile
 
 import numpy as np
@@ -22,8 +24,10 @@ from drakerock.pile.config import RocksConfig
 from drakerock.pile.shapes import RockShape, load_rock_shapes
 from drakerock.pile.state import PileState
 
-# Piles made by tests never come from, nor go to, the user's cache.
-os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="drakerock-cache-")
+# Piles and kernels made by tests never come from, nor go to, the user's cache; pytest-xdist's workers share one.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="drakerock-cache-")
+    atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
 
 settings.register_profile("drakerock", deadline=None, max_examples=30, derandomize=True)
 settings.load_profile("drakerock")

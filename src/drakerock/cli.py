@@ -195,7 +195,7 @@ def machine_show(
 
     Example: drakerock machine show --out out/machine
     """
-    from drakerock.loading.cycle import make_folder
+    from drakerock.files import make_folder
     from drakerock.machine.page import write_machine_page
 
     make_folder(out)
@@ -206,6 +206,8 @@ def machine_show(
 
 study_app = typer.Typer(no_args_is_help=True, help="Campaigns: many sequences of loadings, stored.")
 app.add_typer(study_app, name="study")
+WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes [default: one per core].")]
+SchedulerOption = Annotated[str | None, typer.Option(help="Address of a Dask scheduler to run on.")]
 StudyFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a study.")]
 
 
@@ -213,8 +215,8 @@ StudyFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a st
 def study_run(
     study: Annotated[Path, typer.Argument(help="Study YAML file.")],
     out: Annotated[Path, typer.Option("--out", help="Folder of the study; made if missing.")],
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes [default: one per core].")] = None,
-    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to run on.")] = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a study key (dotted).")
     ] = None,
@@ -309,6 +311,8 @@ def study_report(
 def study_confirm(
     folder: StudyFolder,
     points: Annotated[int | None, typer.Option(help="How many front points to simulate again.")] = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
     json_: JsonOption = False,
 ) -> None:
     """Simulate chosen Pareto points again: predicted against simulated. Interrupted, it goes on when called again.
@@ -316,9 +320,13 @@ def study_confirm(
     Example: drakerock study confirm out/paper --points 5
     """
     from drakerock.study.analysis import format_confirmation, run_confirm
-    from drakerock.study.runner import make_evaluate
+    from drakerock.study.resimulation import Resimulation
 
-    confirmation = run_confirm(folder, make_evaluate(folder), points)
+    def say(text: str) -> None:
+        console.print(Text(text), soft_wrap=True)
+
+    again = Resimulation(folder, workers=workers, scheduler=scheduler, say=say)
+    confirmation = run_confirm(folder, again.evaluate, points, again.run)
     if json_:
         print(json.dumps(confirmation.to_rows(), indent=2))
     else:

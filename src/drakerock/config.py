@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -39,13 +39,17 @@ def calc_config_hash(config: BaseModel, *extra: str) -> str:
 
 
 def load_config[ConfigT: Config](
-    path: str | Path, schema: type[ConfigT], overrides: Sequence[str] = ()
+    path: str | Path,
+    schema: type[ConfigT],
+    overrides: Sequence[str] = (),
+    complete: Callable[[dict[str, Any]], None] | None = None,
 ) -> ConfigT:
     """Read a YAML file into `schema`.
 
     Args:
         path: the YAML file; an empty file means all defaults.
         overrides: ``"dotted.key=value"`` strings, the value in YAML, applied on top of the file.
+        complete: may alter the data before they are checked, such as by what another file holds.
 
     Raises:
         InputError: unreadable file, YAML syntax, unknown key, value out of range.
@@ -57,13 +61,17 @@ def load_config[ConfigT: Config](
         raise InputError(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
-    return parse_config(text, schema, overrides, source=str(path))
+    return parse_config(text, schema, overrides, source=str(path), complete=complete)
 
 
 def parse_config[ConfigT: Config](
-    text: str, schema: type[ConfigT], overrides: Sequence[str] = (), source: str = "<text>"
+    text: str,
+    schema: type[ConfigT],
+    overrides: Sequence[str] = (),
+    source: str = "<text>",
+    complete: Callable[[dict[str, Any]], None] | None = None,
 ) -> ConfigT:
-    """Parse YAML text into `schema`; `source` is the name used in messages. Raises as `load_config`."""
+    """Parse YAML text into `schema`; `source` is the name used in messages. Otherwise as `load_config`."""
     try:
         node = yaml.compose(text, Loader=yaml.SafeLoader)
         data = yaml.safe_load(text)
@@ -78,6 +86,8 @@ def parse_config[ConfigT: Config](
             f"{source}: expected keys and values at the top level, found a {type(data).__name__}"
         )
     overridden = _apply_overrides(data, overrides)
+    if complete:
+        complete(data)
     try:
         return schema.model_validate(data)
     except ValidationError as error:

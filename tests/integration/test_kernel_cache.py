@@ -47,3 +47,88 @@ def test_cold_and_warm_cache_give_the_same_bits(tmp_path):
     ]
     assert runs[0].stdout == runs[1].stdout
     assert len(runs[0].stdout.strip()) == 64
+
+
+KERNELS = """
+from drakerock.dynamics.nonsmooth.compiling import kernel
+
+
+@kernel
+def add_up(values, power):
+    total = 0.0
+    for value in values:
+        total += value**power
+    return total
+
+
+@kernel
+def find_mean(values, power):
+    return (add_up(values, power) / len(values)) ** (1 / power)
+"""
+
+USE = """
+import sys
+import numpy as np
+sys.path.insert(0, ".")
+import kernels
+
+print("ready", flush=True)
+input()
+assert kernels.find_mean(np.full(9, 2.0), 2.0) == 2.0
+print(sum(sum(item.stats.cache_misses.values()) for item in (kernels.find_mean, kernels.add_up)))
+"""
+
+HOLD = """
+import time
+from drakerock.dynamics.nonsmooth import compiling
+
+with compiling._one_process:
+    print("held", flush=True)
+    time.sleep(100)
+"""
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Return a function that starts a program with a kernel cache of the test's own."""
+    (tmp_path / "kernels.py").write_text(KERNELS)
+    processes = []
+
+    def run(program):
+        processes.append(
+            subprocess.Popen(
+                [sys.executable, "-c", program], cwd=tmp_path, text=True,
+                env=os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")},
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            )
+        )  # fmt: skip
+        return processes[-1]
+
+    yield run
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def test_processes_that_start_together_compile_each_kernel_once(start):
+    users = [start(USE) for _ in range(3)]
+    for user in users:
+        assert user.stdout.readline() == "ready\n", user.communicate()[1]
+    for user in users:
+        user.stdin.write("\n")
+        user.stdin.flush()
+    answers = [user.communicate(timeout=120) for user in users]
+    assert sorted(int(out) for out, _ in answers) == [0, 0, 2], [error for _, error in answers]
+
+
+def test_a_process_killed_while_it_compiles_leaves_no_lock(start):
+    holder, user = start(HOLD), start(USE)
+    assert holder.stdout.readline() == "held\n", holder.communicate()[1]
+    assert user.stdout.readline() == "ready\n", user.communicate()[1]
+    user.stdin.write("\n")
+    user.stdin.flush()
+    with pytest.raises(subprocess.TimeoutExpired):
+        user.wait(timeout=1.0)  # it waits
+    holder.kill()
+    out, error = user.communicate(timeout=120)
+    assert out == "2\n", error

@@ -8,10 +8,14 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
+from drakerock.config import calc_config_hash
 from drakerock.exploration.table import ResponseTable
 from drakerock.resources import find_data
+from drakerock.study.runner import run_study
 from drakerock.study.schema import load_study
 from drakerock.study.store import Store
 
@@ -67,6 +71,36 @@ def test_a_real_study_killed_in_a_cycle_ends_the_same(tmp_path):
     table = ResponseTable.load(tmp_path / "killed")
     assert table.Y.shape == (3, 3)
     assert set(table.n_loadings) == {2}
+
+
+def test_controller_and_machine_parameters_act_on_a_real_study(tmp_path):
+    """The shipped study that varies no dig variable: two points with the real simulation, on a few rocks."""
+    study = load_study(
+        find_data("studies", "control_parameters.yaml"),
+        [
+            "scenario.site.void_depth=0.6", "scenario.pile.rocks=60", "scenario.pile.emission_height=2.0",
+            "scenario.pile.emission_reach=1.2", "scenario.pile.settle_speed=0.2", "loadings=1",
+            "exploration.sampling.n_initial=2", "exploration.sampling.n_corners=0",
+            "exploration.sampling.n_samples=2", "exploration.sampling.n_validation=0", "executor.kind=serial",
+        ],
+    )  # fmt: skip
+    status = run_study(study, tmp_path)
+    assert status["complete"]
+    assert status["cycles"]["failed"] == 0
+    table = ResponseTable.load(tmp_path)
+    assert table.problem.objective_names == ("production", "damage", "specific_energy")
+    # So few rocks may leave the bucket empty, and then there is no energy per tonne.
+    assert np.isfinite(table.Y[:, :2]).all()
+    energies = pq.read_table(tmp_path / "loadings.parquet")["energy_J"].to_pylist()
+    assert len(set(energies)) == 2
+    assert min(energies) > 0.0
+    for point, x in zip(table.point, table.X, strict=True):
+        outcome = json.loads((tmp_path / f"points/{point}/attempt_0/loading_00/outcome.json").read_text())
+        assert outcome["strategy"] == study.scenario.loading.strategy.model_dump()  # the dig strategy is held
+        scenario = study.make_scenario(x, point)
+        assert scenario.loading.planning.v_x_max == x[0]
+        assert scenario.machine.boom.effort == x[3]
+        assert outcome["scenario_hash"] == calc_config_hash(scenario)
 
 
 @pytest.mark.parametrize("name", ["smoke", "reduced", "paper", "control_parameters"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import version
@@ -337,11 +338,11 @@ def fetch_pile(recipe: PileRecipe, progress: Progress | None = None) -> tuple[Pi
         try:
             return load_pile(path), path
         except InputError:
-            path.unlink()  # a damaged cache entry is made anew
+            path.unlink(missing_ok=True)  # a damaged cache entry is made anew
     pile = make_pile(recipe, progress)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".partial")
+        partial = path.with_suffix(f".{os.getpid()}.partial")  # workers may make the same pile at once
         save_pile(pile, partial)
         partial.replace(path)
     except OSError:

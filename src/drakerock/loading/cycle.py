@@ -17,7 +17,8 @@ from pydrake.systems.framework import Context, EventStatus
 
 import drakerock
 from drakerock.config import calc_config_hash
-from drakerock.errors import InputError, SimulationFailure
+from drakerock.errors import SimulationFailure
+from drakerock.files import make_folder, write_text
 from drakerock.loading.control import TIMEOUTS, WAYPOINT_TIMES, Mode
 from drakerock.loading.field import HeightField
 from drakerock.loading.performance import calc_damage, find_bucket_load, find_debris, find_events, find_lost
@@ -281,31 +282,6 @@ def save_cycle(result: CycleResult, folder: str | Path) -> list[Path]:
         "outcome.json",
     ]
     return [folder / name for name in names if (folder / name).exists()]
-
-
-def make_folder(folder: Path) -> None:
-    """Make an output folder.
-
-    Raises:
-        InputError: it cannot be made or written.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".writable"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(f"--out {folder}: the folder cannot be written: {error.strerror}") from None
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all; InputError if it cannot be written."""
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def _place(station: Station, root: Any, x_tip: float, y: float) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 from drakerock.config import calc_config_hash
 from drakerock.dynamics.settling import fetch_pile, refill
 from drakerock.errors import InputError, SimulationFailure
-from drakerock.loading.cycle import CycleOutcome, CycleResult, make_folder, run_cycle, save_cycle
+from drakerock.files import make_folder
+from drakerock.loading.cycle import CycleOutcome, CycleResult, run_cycle, save_cycle
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.pile.shapes import load_rock_shapes
 from drakerock.pile.state import PileState, load_pile, save_pile

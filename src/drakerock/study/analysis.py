@@ -9,7 +9,7 @@ shown in the report.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,11 @@ from drakerock.errors import InputError
 from drakerock.exploration.analysis import ExplorationConfig, explore
 from drakerock.exploration.confirmation import Confirmation, Evaluate, confirm_points
 from drakerock.exploration.pareto import pareto_front, parse_bound, select_spread
-from drakerock.exploration.problem import Problem, format_number
+from drakerock.exploration.problem import Array, Problem, format_number
 from drakerock.exploration.strategy import Strategy, choose_strategy, parse_weights
 from drakerock.exploration.surrogate import fit_surrogate
 from drakerock.exploration.table import ResponseTable
+from drakerock.files import write_text
 from drakerock.study.store import DATABASE, export_tables
 
 _CONFIRMATION = "confirmation.json"
@@ -73,7 +74,12 @@ def run_strategy(
     return choose_strategy(pareto_front(surrogate, limits, config.pareto, seed), weights, limits)
 
 
-def run_confirm(source: str | Path, evaluate: Evaluate, n: int | None = None) -> Confirmation:
+def run_confirm(
+    source: str | Path,
+    evaluate: Evaluate,
+    n: int | None = None,
+    prepare: Callable[[Array], None] | None = None,
+) -> Confirmation:
     """Simulate points of the front again and store predicted against simulated in `confirmation.json`.
 
     Args:
@@ -81,6 +87,7 @@ def run_confirm(source: str | Path, evaluate: Evaluate, n: int | None = None) ->
         evaluate: from a point (d,) to mean responses and standard errors (k,), in natural senses.
         n: how many points: the knee, the best of each objective, then points spread between them. None: the
             settings' `n_confirm`.
+        prepare: called with all points (n, d) before the first is evaluated, to simulate them at once.
 
     Raises:
         InputError: see `ResponseTable.load` and `explore`; n below one.
@@ -91,12 +98,12 @@ def run_confirm(source: str | Path, evaluate: Evaluate, n: int | None = None) ->
     surrogate = fit_surrogate(table, config.surrogate, seed)
     front = pareto_front(surrogate, config=config.pareto, seed=seed)
     chosen = select_spread(front, n or config.n_confirm, [choose_strategy(front).index])
+    if prepare:
+        prepare(front.X[chosen])
     confirmation = confirm_points(surrogate, front.X[chosen], evaluate)
     path = _find_folder(Path(source)) / _CONFIRMATION
     # Whole or not at all: a report may be made while this is written.
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(confirmation.to_rows(), indent=2) + "\n", encoding="utf-8")
-    part.replace(path)
+    write_text(path, json.dumps(confirmation.to_rows(), indent=2) + "\n")
     return confirmation
 
 

@@ -22,6 +22,13 @@ from drakerock.study.work import Task, TaskResult, run_task
 
 # One thread each: the simulation is sequential, and there is a process for every core.
 THREADS = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+# Dask looks at what its workers do a hundred times a second, and at its event loops fifty times: together a tenth
+# of a core for each worker that is busy with a single task for minutes.
+DASK = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "5s",
+}
 
 
 class WorkerLost(Exception):
@@ -37,10 +44,12 @@ class Executor(ABC):
     Attributes:
         name: for people.
         dashboard: address of the Dask dashboard; "" if there is none.
+        local: its workers are other processes of this machine.
     """
 
     name: str
     dashboard: str = ""
+    local: bool = False
 
     @property
     @abstractmethod
@@ -110,6 +119,7 @@ class DaskExecutor(Executor):
         self._futures: dict[Any, Task] = {}
         self._n_workers, self._counted = 0, -1e9
         self._wanted = wanted
+        self.local = wanted > 0
 
     @property
     def n_workers(self) -> int:
@@ -235,6 +245,10 @@ def make_slurm_cluster(config: SlurmConfig, folder: Path) -> Any:
         job_extra_directives=list(config.directives),
         job_script_prologue=[
             *(f"export {name}={value}" for name, value in THREADS.items()),
+            *(
+                f"export DASK_{key.upper().replace('.', '__').replace('-', '_')}={value}"
+                for key, value in DASK.items()
+            ),
             *config.prologue,
         ],
         scheduler_options={"dashboard_address": ":0"},
@@ -256,7 +270,7 @@ def _start_local(workers: int, memory_limit: str) -> DaskExecutor:
     from distributed import LocalCluster
 
     # Dask would silently try the task of a dead worker on three more; the runner does that, and counts.
-    with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
+    with dask.config.set(DASK | {"distributed.scheduler.allowed-failures": 0}):
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -265,6 +279,7 @@ def _start_local(workers: int, memory_limit: str) -> DaskExecutor:
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
             env=THREADS,
+            config=DASK,  # of workers that are started later, too
             preload=["drakerock.study.worker_setup"],
             silence_logs=logging.CRITICAL,
         )

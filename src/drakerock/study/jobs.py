@@ -11,7 +11,8 @@ import numpy as np
 
 from drakerock.dynamics.settling import calc_creep, fetch_pile
 from drakerock.exploration.noise import calc_standard_error
-from drakerock.loading.cycle import CycleOutcome, make_folder, run_cycle, save_cycle, write_text
+from drakerock.files import make_folder, write_text
+from drakerock.loading.cycle import CycleOutcome, run_cycle, save_cycle
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.loading.sequence import run_sequence
 from drakerock.pile.shapes import load_rock_shapes

@@ -16,19 +16,15 @@ from math import floor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from drakerock.dynamics.nonsmooth.compiling import are_kernels_compiled, describe_compilation
 from drakerock.errors import InputError, RunStopped
-from drakerock.exploration.confirmation import Evaluate
-from drakerock.exploration.noise import calc_autocorrelation, calc_standard_error
 from drakerock.exploration.problem import Array
 from drakerock.exploration.sampling import make_sampler, make_validation_points
 from drakerock.study.display import Display
 from drakerock.study.executors import Executor, WorkerLost, make_executor
-from drakerock.study.objectives import get_objective
 from drakerock.study.schema import StudyConfig
-from drakerock.study.store import Point, Store, export_tables, get_versions, read_outcome
-from drakerock.study.work import Task, TaskResult, run_task
+from drakerock.study.store import Point, Store, export_tables, get_versions
+from drakerock.study.work import Task, TaskResult
 
 RUN_SEQUENCE = "drakerock.loading.sequence:run_sequence"
 _POLL = 0.5
@@ -93,7 +89,7 @@ class _Runner:
         ending, run = "failed", None
         executor: Executor | None = None
         try:
-            with _catch_signals(self._ask_to_stop):
+            with catch_signals(self._ask_to_stop):
                 executor = make_executor(
                     self._study.executor, self._look, self._store.folder, workers, scheduler
                 )
@@ -127,6 +123,9 @@ class _Runner:
             self._display.say(f"running on {executor.name}, {executor.n_workers} workers")
             if executor.dashboard:
                 self._display.say(f"Dask dashboard: {executor.dashboard}")
+            nonsmooth = self._study.scenario.dynamics.rocks == "nonsmooth"
+            if executor.local and nonsmooth and self._work == RUN_SEQUENCE and not are_kernels_compiled():
+                self._display.say(describe_compilation())
 
     def _ask_to_stop(self) -> None:
         self._stop_file.touch()
@@ -255,64 +254,12 @@ class _Sequence:
         self.deaths = 0
 
 
-def make_evaluate(folder: str | Path, work: str = RUN_SEQUENCE) -> Evaluate:
-    """Return the function that simulates a design point of a study anew.
-
-    It runs a sequence as the study does, in ``DIR/confirmation``; interrupted and called again it goes on
-    there. The standard errors use the autocorrelation of the study's own sequences.
-
-    Raises:
-        InputError: there is no study in that folder.
-    """
-    folder = Path(folder)
-    with Store.open(folder) as store:
-        study, loadings = store.study, store.read_loadings()
-    functions = [get_objective(name) for name in study.objectives]
-    rho = []
-    for item in functions:
-        sequences: dict[tuple[str, int], list[float]] = {}
-        for row in loadings.select(["point", "attempt", item.objective.name]).to_pylist():
-            value = row[item.objective.name]
-            key = (row["point"], row["attempt"])
-            sequences.setdefault(key, []).append(np.nan if value is None else value)
-        rho.append(calc_autocorrelation(sequences.values()))
-
-    def evaluate(x: Array) -> tuple[Array, Array]:
-        place = folder / "confirmation" / "_".join(f"{value:.12g}" for value in x)
-        scenario = study.make_scenario(x, "confirmation", 0)
-        task = Task(
-            "confirmation",
-            0,
-            scenario,
-            study.loadings,
-            place.resolve(),
-            place / ".stop",
-            study.loadings,
-            work,
-        )
-        result = run_task(task)
-        if result.status != "done":
-            raise RuntimeError(result.reason)
-        outcomes = [read_outcome(path) for path in sorted(place.glob("loading_*/outcome.json"))]
-        Y = np.array(
-            [
-                [np.nan if outcome.status == "failed" else item.function(outcome) for item in functions]
-                for outcome in outcomes
-            ],
-            dtype=float,
-        )
-        means = np.nanmean(Y, axis=0)
-        return means, np.array([calc_standard_error(y, r) for y, r in zip(Y.T, rho, strict=True)])
-
-    return evaluate
-
-
 def _next_batch(points: list[Point]) -> int:
     return max((point.batch for point in points), default=-1) + 1
 
 
 @contextmanager
-def _catch_signals(ask_to_stop: Any) -> Iterator[None]:
+def catch_signals(ask_to_stop: Any) -> Iterator[None]:
     """First Ctrl-C: ask to stop; the second raises KeyboardInterrupt; SIGTERM raises SystemExit(143)."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -267,12 +267,16 @@ def load_study(path: str | Path, overrides: Sequence[str] = ()) -> StudyConfig:
             that the scenario does not allow, a module that cannot be imported.
     """
     path = Path(path)
-    first = load_config(path, _StudyFile, overrides)
+
+    def complete(data: dict[str, Any]) -> None:
+        name, changes = data.get("scenario_file"), data.get("scenario") or {}
+        if isinstance(name, str) and isinstance(changes, dict):
+            # A shipped study may lie in a wheel: what it names is beside it.
+            base = load_config(path.parent / name, Scenario).model_dump(mode="json")
+            data["scenario"] = _merge(base, changes)
+
+    first = load_config(path, _StudyFile, overrides, complete)
     data = first.model_dump(mode="json", exclude_unset=True)
-    if first.scenario_file is not None:
-        # A shipped study may lie in a wheel: what it names is beside it.
-        base = load_config(path.parent / first.scenario_file, Scenario).model_dump(mode="json")
-        data["scenario"] = _merge(base, data.get("scenario", {}))
     data.pop("scenario_file", None)
     data["modules"] = [
         str((path.parent / module).resolve()) if module.endswith(".py") else module

@@ -39,7 +39,8 @@ from drakerock.config import calc_config_hash
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.problem import Array
 from drakerock.exploration.table import ResponseTable, average_loadings
-from drakerock.loading.cycle import CycleOutcome, make_folder, write_text
+from drakerock.files import make_folder, write_text
+from drakerock.loading.cycle import CycleOutcome
 from drakerock.loading.scenario import Scenario
 from drakerock.study.objectives import get_objective
 from drakerock.study.schema import StudyConfig
@@ -149,6 +150,9 @@ class Store:
                 db.execute("INSERT OR IGNORE INTO meta VALUES ('identity', ?)", (study.calc_identity(),))
                 db.execute("UPDATE runs SET ending = 'killed' WHERE ending = ''")
             return store
+        except sqlite3.DatabaseError as error:
+            lock.close()
+            raise _explain(folder / DATABASE, error) from None
         except BaseException:
             lock.close()
             raise
@@ -163,7 +167,7 @@ class Store:
         folder = Path(folder)
         if not (folder / DATABASE).exists():
             raise InputError(f"{folder}: no study here ({DATABASE} is missing); make one with `study run`")
-        return cls(folder, read_study(folder), _connect(folder / DATABASE))
+        return cls(folder, read_study(folder), _connect(folder / DATABASE, make=False))
 
     def __enter__(self) -> Self:
         return self
@@ -172,6 +176,8 @@ class Store:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+        if isinstance(error, sqlite3.DatabaseError):
+            raise _explain(self.folder / DATABASE, error) from None
 
     def close(self) -> None:
         """Close the database and give up the lock."""
@@ -518,9 +524,13 @@ class Store:
     def verify(self) -> list[Fault]:
         """Check the database, every recorded file's checksum, and that nothing else lies about."""
         faults = []
-        for (message,) in self._db.execute("PRAGMA integrity_check"):
-            if message != "ok":
-                faults.append(Fault("database", DATABASE, message))
+        try:
+            messages = [message for (message,) in self._db.execute("PRAGMA integrity_check")]
+        except sqlite3.DatabaseError as error:
+            messages = [str(error)]
+        if messages != ["ok"]:
+            # What such a database says of the files is worth nothing.
+            return [Fault("database", DATABASE, message) for message in messages]
         for row in self._db.execute("PRAGMA foreign_key_check"):
             faults.append(Fault("database", DATABASE, f"table {row[0]} has a row without its {row[2]}"))
         (identity,) = self._db.execute("SELECT value FROM meta WHERE key = 'identity'").fetchone()
@@ -644,22 +654,30 @@ def get_versions() -> dict[str, str]:
     }
 
 
-def _connect(path: Path) -> sqlite3.Connection:
+def _connect(path: Path, make: bool = True) -> sqlite3.Connection:
     try:
         db = sqlite3.connect(path, isolation_level=None, timeout=30.0)
         (found,) = db.execute("PRAGMA user_version").fetchone()
         if found > _SCHEMA_VERSION:
             raise InputError(f"{path}: made by a newer version (format {found}, not {_SCHEMA_VERSION})")
         if found == 0:
+            (tables,) = db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
+            if tables or not make:
+                raise InputError(f"{path}: not a readable study database: {'foreign' if tables else 'empty'}")
             db.execute("PRAGMA journal_mode = WAL")
             db.executescript(f"BEGIN;{_SCHEMA}PRAGMA user_version = {_SCHEMA_VERSION};COMMIT;")
         db.execute("PRAGMA synchronous = FULL")
         db.execute("PRAGMA foreign_keys = ON")
         return db
-    except sqlite3.OperationalError as error:
-        raise RunStopped(f"{path}: {error}") from None
     except sqlite3.DatabaseError as error:
-        raise InputError(f"{path}: not a readable study database: {error}") from None
+        raise _explain(path, error) from None
+
+
+def _explain(path: Path, error: sqlite3.DatabaseError) -> InputError | RunStopped:
+    """Return what to tell of an error of the database: trouble with the disk, or no database of ours."""
+    if isinstance(error, sqlite3.OperationalError):
+        return RunStopped(f"{path}: {error}")
+    return InputError(f"{path}: not a readable study database: {error}")
 
 
 def _write_study(folder: Path, study: StudyConfig) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 from typing import Any
 
@@ -9,3 +10,5 @@ from typing import Any
 def dask_setup(_worker: Any) -> None:
     """Ignore Ctrl-C, which a terminal sends to all its processes: the runner decides when workers stop."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The runner says it, for all of them.
+    logging.getLogger("drakerock.dynamics.nonsmooth.compiling").setLevel(logging.ERROR)

@@ -40,7 +40,14 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def run(monkeypatch):
-    monkeypatch.setattr("drakerock.study.runner.make_evaluate", lambda path: evaluate)
+    class Known:
+        def __init__(self, folder, **options):
+            self.evaluate = evaluate
+
+        def run(self, X):
+            assert X.shape == (3, 4)
+
+    monkeypatch.setattr("drakerock.study.resimulation.Resimulation", Known)
     return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
 
 

@@ -13,7 +13,8 @@ from drakerock.config import parse_config
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.table import ResponseTable
 from drakerock.study.executors import make_slurm_cluster
-from drakerock.study.runner import make_evaluate, run_study
+from drakerock.study.resimulation import Resimulation
+from drakerock.study.runner import run_study
 from drakerock.study.schema import SlurmConfig, StudyConfig
 from drakerock.study.store import Store, export_tables
 
@@ -261,10 +262,44 @@ def test_a_study_of_machine_and_control_parameters(tmp_path):
 
 def test_confirmation_simulates_as_the_study_does(finished, copy):
     table = ResponseTable.load(copy)
-    evaluate = make_evaluate(copy, WORK)
-    mean, se = evaluate(table.X[3])
+    mean, se = Resimulation(copy, work=WORK).evaluate(table.X[3])
     assert mean == pytest.approx(table.Y[3])
     assert se == pytest.approx(table.noise[3], rel=0.3)
+
+
+def test_confirmation_runs_all_points_first_and_none_twice(copy, monkeypatch, tmp_path):
+    X = ResponseTable.load(copy).X[:3]
+    monkeypatch.setattr(study_work, "LOG", str(tmp_path / "log"))
+    said = []
+    again = Resimulation(copy, work=WORK, say=said.append)
+    again.run(X)
+    assert said == ["running on this process, 1 workers"] + [f"{k} of 3 points simulated" for k in (1, 2, 3)]
+    means = [again.evaluate(x)[0] for x in X]
+    Resimulation(copy, work=WORK).run(X)
+    assert (tmp_path / "log").read_text().count("finish") == 12
+    assert means == pytest.approx(np.array([Resimulation(copy, work=WORK).evaluate(x)[0] for x in X]))
+
+
+@pytest.mark.parametrize(("mode", "reason"), [("raise", "made to fail"), ("fail", "solver failure")])
+def test_confirmation_keeps_failures(copy, behave, mode, reason):
+    table = ResponseTable.load(copy)
+    high, low = table.X[table.X[:, 0] > 1.5][0], table.X[table.X[:, 0] < 1.5][0]
+    behave(mode)
+    again = Resimulation(copy, work=WORK)
+    again.run(np.array([high, low]))
+    assert np.isfinite(again.evaluate(low)[0]).all()
+    if mode == "raise":
+        with pytest.raises(RuntimeError, match=reason):
+            again.evaluate(high)
+    else:  # the loading before the failed one counts
+        assert np.isfinite(again.evaluate(high)[0]).all()
+
+
+def test_confirmation_stopped_by_a_full_disk(copy, behave):
+    X = ResponseTable.load(copy).X
+    behave("disk")
+    with pytest.raises(RunStopped, match="No space left"):
+        Resimulation(copy, work=WORK).run(X[X[:, 0] > 1.5][:1])
 
 
 def test_export_names_its_formats(copy):

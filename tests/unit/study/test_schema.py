@@ -41,6 +41,12 @@ def test_scenario_file_and_differences_and_overrides(write):
     assert study.scenario_file is None
 
 
+def test_differences_are_checked_together_with_the_file_they_differ_from(write):
+    write("base.yaml", site={"void_depth": 2.0, "rear_layer": 0.0})
+    path = write(scenario_file="base.yaml", scenario={"site": {"void_depth": 0.6}})
+    assert load_study(path).scenario.site.void_depth == 0.6  # too little for the default's rear layer
+
+
 def test_any_number_of_the_scenario_may_be_a_variable(write):
     variables = [
         {"name": "effort", "key": "machine.boom.effort", "low": 1e5, "high": 2e6, "unit": "N m"},

@@ -6,8 +6,10 @@ kernel that it loads, not in the files of the kernels called from there.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import logging
+import os
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +17,7 @@ from typing import Any
 
 import numba
 import platformdirs
+from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import NDArray
 
 # Types of the kernels' arguments: arrays of any number type, a rotation by rows, a vector in three numbers.
@@ -47,12 +50,67 @@ def kernel[Function: Callable[..., Any]](function: Function) -> Function:
         decorated: Function = numba.njit(cache=True, error_model="numpy")(function)
     finally:
         numba.config.CACHE_DIR = before
+    if not numba.config.DISABLE_JIT:
+        _compile_alone(decorated)
     return decorated
+
+
+class _OneProcess:
+    """Held while compiling into the cache folder, or loading from it: by one process of all that share the folder.
+
+    The lock is the operating system's, so it ends with its process, however that ends. Within a process numba's
+    own lock keeps threads apart; a kernel that is compiled for another one enters again.
+    """
+
+    def __init__(self) -> None:
+        self._depth, self._file = 0, -1
+
+    def __enter__(self) -> None:
+        global_compiler_lock.acquire()
+        if self._depth == 0:
+            try:
+                folder = find_cache_folder()
+                folder.mkdir(parents=True, exist_ok=True)
+                self._file = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+                fcntl.flock(self._file, fcntl.LOCK_EX)
+            except OSError as error:  # a file system without locks costs time, no more
+                _log.debug("drakerock: the kernels' folder cannot be locked: %s", error)
+        self._depth += 1
+
+    def __exit__(self, *_error: object) -> None:
+        self._depth -= 1
+        if self._depth == 0 and self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+        global_compiler_lock.release()
+
+
+_one_process = _OneProcess()
+
+
+def _compile_alone(dispatcher: Any) -> None:
+    """Make processes that need the same kernel at once compile it once: the others wait, then load it."""
+    compile_now = dispatcher.compile
+
+    def compile_alone(signature: Any) -> Any:
+        with _one_process:
+            return compile_now(signature)
+
+    dispatcher.compile = compile_alone
+
+
+def are_kernels_compiled() -> bool:
+    """Return whether kernels have been compiled into the folder before; all of them, unless that was cut short."""
+    return any(find_cache_folder().rglob("*.nbc"))
+
+
+def describe_compilation() -> str:
+    """Return what is said before the kernels are compiled."""
+    return f"compiling the rock engine's kernels into {find_cache_folder()} (once, below a minute)"
 
 
 @lru_cache(maxsize=1)
 def announce_compilation() -> None:
-    """Say once, before the first use, if the kernels are about to be compiled (less than a minute)."""
-    folder = find_cache_folder()
-    if not any(folder.rglob("*.nbc")):
-        _log.warning("drakerock: compiling the rock engine's kernels into %s (once, below a minute)", folder)
+    """Say once, before the first use, if the kernels are about to be compiled."""
+    if not are_kernels_compiled():
+        _log.warning("drakerock: %s", describe_compilation())
