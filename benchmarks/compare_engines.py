@@ -3,7 +3,8 @@
     python benchmarks/compare_engines.py --rocks 300 --seeds 4 --out build/engines.jsonl
 
 Each seed is one pile, filled and at rest in the nonsmooth engine, relaxed for a second in each engine with the
-machine standing, then dug with the same motor targets. Finished runs are skipped.
+machine standing, then dug with the same motor targets. Finished runs are skipped. `--against hydroelastic`: the plant
+engine with pressure fields over faces instead of single points, five times as dear.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from rocks import ROCKS, SHAPES, TIME_STEP, Motors, clear_way, make_dig
 from scipy import stats
 
 from drakerock.dynamics.assembly import add_plant, add_site
-from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
+from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig, PlantEngineConfig
 from drakerock.dynamics.nonsmooth.system import add_nonsmooth_rocks
 from drakerock.dynamics.plant.rocks import add_plant_rocks, add_rock_bodies
 from drakerock.machine.config import MachineConfig
@@ -37,14 +38,19 @@ RELAXING = 1.0
 
 
 def run(pile: PileState, engine: str, site: SiteConfig, depth: float, duration: float) -> dict[str, float]:
-    dynamics = DynamicsConfig(rocks=engine, nonsmooth=NonsmoothConfig(reduction="none"), time_step=TIME_STEP)
+    dynamics = DynamicsConfig(
+        rocks="nonsmooth" if engine == "nonsmooth" else "plant",
+        nonsmooth=NonsmoothConfig(reduction="none"),
+        plant=PlantEngineConfig(contact_model="hydroelastic" if engine == "hydroelastic" else "point"),
+        time_step=TIME_STEP,
+    )
     builder = DiagramBuilder()
     plant, scene_graph = add_plant(builder, dynamics)
     built = make_site(site)
     add_site(plant, built, dynamics)
     machine = add_machine(plant, MachineConfig())
     inputs = []
-    if engine == "plant":
+    if dynamics.rocks == "plant":
         geometries = add_rock_bodies(plant, pile, SHAPES, ROCKS, dynamics)
         plant.Finalize()
         rocks = add_plant_rocks(builder, plant, pile, geometries)
@@ -104,19 +110,22 @@ def main() -> None:
     parser.add_argument("--rocks", type=int, default=300)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--duration", type=float, default=10.0)
+    parser.add_argument("--against", choices=("plant", "hydroelastic"), default="plant")
     parser.add_argument("--out", type=Path, default=Path("build/engines.jsonl"))
     arguments = parser.parse_args()
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
     results = {(r["seed"], r["engine"]): r for r in map(json.loads, lines)}
     site = SIZES["300"][1]
+    engines = ("nonsmooth", arguments.against)
     for seed in range(arguments.seeds):
-        if all((seed, engine) in results for engine in ("plant", "nonsmooth")):
+        todo = [engine for engine in engines if (seed, engine) not in results]
+        if not todo:
             continue
         pile = clear_way(make_small_pile(arguments.rocks, site, 6.0, seed))
         pile = replace(pile, V_WRs=np.zeros((len(pile), 6)))
         depth = np.random.default_rng(seed).uniform(0.6, 1.4)
-        for engine in ("nonsmooth", "plant"):
+        for engine in todo:
             result = run(pile, engine, site, depth, arguments.duration)
             results[seed, engine] = result
             with open(arguments.out, "a", encoding="utf-8") as file:
@@ -125,11 +134,12 @@ def main() -> None:
     for metric in (*METRICS, "cpu_s"):
         a, b = (
             np.array([results[s, engine][metric] for s in range(arguments.seeds)])
-            for engine in ("nonsmooth", "plant")
+            for engine in engines
         )
         half = stats.t.ppf(0.95, len(a) - 1) * (a - b).std(ddof=1) / np.sqrt(len(a)) if len(a) > 1 else np.nan
-        text = f"{metric}: nonsmooth {a.mean():.4g}, plant {b.mean():.4g}, difference {(a - b).mean():.3g}"
-        print(f"{text} ± {half:.3g}")
+        text = f"{metric}: nonsmooth {a.mean():.4g}, {engines[1]} {b.mean():.4g}"
+        share = 100 / b.mean()
+        print(f"{text}, difference {share * (a - b).mean():+.1f} ± {share * half:.1f} % (90 %, {len(a)} pairs)")
 
 
 if __name__ == "__main__":
