@@ -107,6 +107,9 @@ def load(
     loadings: Annotated[
         int | None, typer.Option(min=1, help="Run or resume a sequence of so many loadings.")
     ] = None,
+    replay: Annotated[
+        bool, typer.Option(help="Write replay.html, of each loading; about 13 MB at full size.")
+    ] = True,
     figures: Annotated[bool, typer.Option("--figures", help="Write the pictures, too, as PNG.")] = False,
     seed: SeedOption = None,
     set_: SetOption = None,
@@ -115,6 +118,8 @@ def load(
     """Run one loading cycle, or a sequence, and write outcome, signals, piles and replay.
 
     Example: drakerock load studies/demo.yaml --alpha 1.3 --beta 0.85 --out out/load
+
+    Example: drakerock load studies/small.yaml --loadings 5 --figures --out out/five
     """
     from drakerock.study.jobs import run_and_save, run_and_save_sequence
 
@@ -125,7 +130,9 @@ def load(
     config = _load(scenario, seed, [*(set_ or []), *overrides])
     if loadings is not None:
         with _show_progress("load") as advance:
-            summary, paths = run_and_save_sequence(config, loadings, out, advance, figures=figures)
+            summary, paths = run_and_save_sequence(
+                config, loadings, out, advance, replay=replay, figures=figures
+            )
         if json_:
             print(json.dumps(summary))
         else:
@@ -135,7 +142,7 @@ def load(
             raise SimulationFailure(summary["reasons"][-1])
         return
     with _show_progress("load") as advance:
-        result, paths = run_and_save(config, out, advance, figures=figures)
+        result, paths = run_and_save(config, out, advance, replay=replay, figures=figures)
     if json_:
         print(result.to_json(), end="")
     else:

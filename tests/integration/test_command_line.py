@@ -109,13 +109,13 @@ def sequence(place):
     args = ["load", str(place / "small.yaml"), "--set", "dynamics.rocks=nonsmooth", "--alpha", "0.4"]
     args += ["--out", str(place / "sequence")]
     return [
-        CliRunner().invoke(app, [*args, *more])
-        for more in (["--loadings", "1"], ["--loadings", "2", "--figures"])
+        (CliRunner().invoke(app, [*args, *more]), sorted(path.name for path in place.glob("sequence/*/*")))
+        for more in (["--loadings", "1", "--no-replay"], ["--loadings", "2", "--figures"])
     ]
 
 
 def test_sequence_writes_loadings_and_summary_and_goes_on(place, sequence):
-    first, second = sequence
+    (first, _), (second, _) = sequence
     assert first.exit_code == 0, first.output
     assert second.exit_code == 0, second.output
     assert "standard error" in second.stdout
@@ -133,6 +133,13 @@ def test_sequence_writes_loadings_and_summary_and_goes_on(place, sequence):
     assert row["values"] == productions
     assert row["mean"] == pytest.approx(np.mean(productions))
     assert row["standard_error"] == pytest.approx(np.std(productions, ddof=1) / np.sqrt(2))
+
+
+def test_each_loading_of_a_sequence_has_its_replay_unless_not_wanted(place, sequence):
+    (_, without), (_, both) = sequence
+    assert "outcome.json" in without
+    assert "replay.html" not in without
+    assert both.count("replay.html") == both.count("outcome.json") == 2
 
 
 def test_figures_and_resolved_scenario_are_written(place, sequence):

@@ -12,6 +12,7 @@ import numpy as np
 from drakerock.dynamics.settling import calc_creep, fetch_pile
 from drakerock.exploration.noise import calc_standard_error
 from drakerock.loading.cycle import CycleOutcome, make_folder, run_cycle, save_cycle, write_text
+from drakerock.loading.recording import load_recording
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.loading.sequence import run_sequence
 from drakerock.pile.shapes import load_rock_shapes
@@ -38,7 +39,12 @@ def get_pile(scenario: Scenario, progress: Callable[..., None] | None = None) ->
 
 
 def run_and_save(
-    scenario: Scenario, folder: Path, progress: Callable[..., None], *, figures: bool = False
+    scenario: Scenario,
+    folder: Path,
+    progress: Callable[..., None],
+    *,
+    replay: bool = True,
+    figures: bool = False,
 ) -> tuple[CycleOutcome, list[Path]]:
     """Get the pile, run the cycle, write its files and the replay.
 
@@ -46,6 +52,7 @@ def run_and_save(
         scenario: the configuration.
         folder: where to write.
         progress: called with stage, share in [0, 1] or None, and a note.
+        replay: whether to write replay.html.
         figures: whether to write the pictures, too.
 
     Raises:
@@ -60,8 +67,9 @@ def run_and_save(
     progress("writing", None)
     paths = save_cycle(result, folder)
     if result.recording is not None:
-        write_replay(result.recording, folder / "replay.html")
-        paths.append(folder / "replay.html")
+        if replay:
+            write_replay(result.recording, folder / "replay.html")
+            paths.append(folder / "replay.html")
         if figures:
             progress("drawing", None)
             paths += write_cycle_figures(folder)
@@ -74,6 +82,7 @@ def run_and_save_sequence(
     folder: Path,
     progress: Callable[..., None],
     *,
+    replay: bool = True,
     figures: bool = False,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Run or resume a sequence of loadings, and write its summary.
@@ -83,6 +92,7 @@ def run_and_save_sequence(
         n_loadings: how many.
         folder: where to write: loading_00, loading_01, ... with a cycle's files each, and sequence.json.
         progress: called with stage, share in [0, 1] or None, and a note.
+        replay: whether to write each loading's replay.html, as soon as it is complete.
         figures: whether to write each loading's pictures, too.
 
     Returns:
@@ -97,12 +107,18 @@ def run_and_save_sequence(
         note = f"loading {number + 1} of {n_loadings}, {time:.1f} s simulated"
         progress(stage, number / n_loadings, note=note)
 
-    outcomes = run_sequence(scenario, n_loadings, folder, progress=tell)
-    places = [folder / f"loading_{number:02d}" for number in range(len(outcomes))]
-    if figures:
-        for place in places:
-            progress("drawing", None, note=place.name)
+    def show(place: Path) -> None:
+        recording, page = place / "recording.npz", place / "replay.html"
+        if not recording.exists():
+            return
+        progress("drawing", None, note=place.name)
+        if replay and not (page.exists() and page.stat().st_mtime >= recording.stat().st_mtime):
+            write_replay(load_recording(recording), page)
+        if figures:
             write_cycle_figures(place)
+
+    outcomes = run_sequence(scenario, n_loadings, folder, progress=tell, finished=show)
+    places = [folder / f"loading_{number:02d}" for number in range(len(outcomes))]
     summary = calc_sequence_summary(outcomes)
     write_text(folder / "sequence.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
     return summary, [*places, folder / "sequence.json"]
