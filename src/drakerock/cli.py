@@ -408,7 +408,8 @@ def _print_outcome(outcome: Any) -> None:
     table.add_row("debris", show(outcome.objectives["debris"], "{:.0f} kg"))
     mass = show(outcome.bucket_mass_kg, "{:.0f} kg")
     table.add_row("bucket load", f"{mass} in {show(outcome.bucket_rocks, '{:d}')} rocks")
-    table.add_row("weighed", show(outcome.weighed_mass_kg, "{:.0f} kg"))
+    counted = show(outcome.counted_when_weighed_kg, "{:.0f} kg")
+    table.add_row("weighed", f"{show(outcome.weighed_mass_kg, '{:.0f} kg')} (counted then: {counted})")
     table.add_row("loading time t4 - t0", show(outcome.loading_time_s, "{:.2f} s"))
     table.add_row("t0 ... t4", "  ".join(show(t, "{:.2f}") for t in outcome.waypoint_times_s) + " s")
     if "volume_m3" in outcome.plan:
@@ -440,6 +441,7 @@ def _print_sequence(summary: dict[str, Any]) -> None:
         "damage": ("damage", "{:.4f}"),
         "debris": ("debris [kg]", "{:.0f}"),
         "bucket_mass_kg": ("bucket load [kg]", "{:.0f}"),
+        "weighed_mass_kg": ("weighed [kg]", "{:.0f}"),
         "loading_time_s": ("loading time [s]", "{:.2f}"),
         "energy_J": ("motors' work [J]", "{:.3g}"),
         "wall_time_s": ("wall time of a cycle [s]", "{:.1f}"),
@@ -455,6 +457,8 @@ def _print_sequence(summary: dict[str, Any]) -> None:
         values = "  ".join("-" if value is None else form.format(value) for value in row["values"])
         table.add_row(Text(label), *numbers, values)  # text, not markup: the units' brackets stay
     output.print(table)
+    events = ", ".join(f"{name} {count}" for name, count in summary["events"].items()) or "none"
+    output.print(f"events: {events}", soft_wrap=True)
 
 
 def _kilo(value: float | None) -> float | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -125,7 +126,8 @@ def run_and_save_sequence(
 
 
 def calc_sequence_summary(outcomes: list[CycleOutcome]) -> dict[str, Any]:
-    """Return what a sequence came to: per quantity mean, spread and standard error, and what ended each loading.
+    """Return what a sequence came to: per quantity mean, spread and standard error, what ended each loading, and how
+    often each event happened.
 
     The spread is the standard deviation of single loadings; the standard error of the mean allows for
     successive loadings resembling each other (`drakerock.exploration.noise`). Failed loadings count in neither;
@@ -133,13 +135,14 @@ def calc_sequence_summary(outcomes: list[CycleOutcome]) -> dict[str, Any]:
     """
     objectives = ("production", "damage", "debris")
     values = {name: [outcome.objectives[name] for outcome in outcomes] for name in objectives}
-    for name in ("bucket_mass_kg", "loading_time_s", "energy_J", "wall_time_s"):
+    for name in ("bucket_mass_kg", "weighed_mass_kg", "loading_time_s", "energy_J", "wall_time_s"):
         values[name] = [getattr(outcome, name) for outcome in outcomes]
     return {
         "loadings": len(outcomes),
         "failed": sum(outcome.status == "failed" for outcome in outcomes),
         "strategy": outcomes[0].strategy if outcomes else None,
         "reasons": [outcome.reason for outcome in outcomes],
+        "events": dict(Counter(item["event"] for outcome in outcomes for item in outcome.events or ())),
         "quantities": {name: _summarise(column) for name, column in values.items()},
         "scenario_hash": outcomes[0].scenario_hash if outcomes else None,
     }
