@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -39,6 +40,7 @@ SeedOption = Annotated[int | None, typer.Option(help="Seed of all randomness.")]
 
 def main() -> None:
     """Run the command line; bad input prints one message and exits with 2, a failed simulation with 1."""
+    logging.getLogger("drake").addFilter(_is_for_users)
     try:
         app()
     except InputError as error:
@@ -54,6 +56,11 @@ def main() -> None:
     except KeyboardInterrupt:
         console.print("interrupted")
         sys.exit(130)
+
+
+def _is_for_users(record: logging.LogRecord) -> bool:
+    """Return False for Drake's notes on how a scene was built and on the server of a page that is only written."""
+    return record.levelno >= logging.WARNING and "half spaces" not in record.getMessage()
 
 
 def _print_error(word: str, error: Exception) -> None:
@@ -154,18 +161,23 @@ def load(
 
 @app.command()
 def replay(
-    folder: Annotated[Path, typer.Argument(help="Folder of a finished cycle.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of a finished cycle, or of a sequence.")],
 ) -> None:
-    """Make replay.html anew from a stored recording.
+    """Make replay.html anew from a stored recording; of a sequence, each loading's.
 
     Example: drakerock replay out/load
     """
     from drakerock.loading.recording import load_recording
     from drakerock.viewing.replay import write_replay
 
-    path = folder / "replay.html"
-    write_replay(load_recording(folder / "recording.npz"), path)
-    _print_paths([path])
+    places = sorted(path.parent for path in folder.glob("loading_*/recording.npz"))
+    if (folder / "recording.npz").exists() or not places:
+        places = [folder]
+    with _show_progress("replay") as advance:
+        for number, place in enumerate(places):
+            advance("drawing", number / len(places), note=place.name)
+            write_replay(load_recording(place / "recording.npz"), place / "replay.html")
+    _print_paths([place / "replay.html" for place in places])
 
 
 machine_app = typer.Typer(no_args_is_help=True, help="The machine: its checks and its looks.")
@@ -378,7 +390,7 @@ def _load(path: Path | None, seed: int | None, overrides: list[str] | None) -> A
 
 
 @contextmanager
-def _show_progress(name: str) -> Iterator[Callable[[str, float | None], None]]:
+def _show_progress(name: str) -> Iterator[Callable[..., None]]:
     """Show what is being done on standard error; plain (and silent) when that is not a terminal."""
     columns = (TextColumn("[bold]{task.fields[stage]:<18}"), BarColumn(), TextColumn("{task.fields[note]}"))
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:

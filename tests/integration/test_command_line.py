@@ -173,7 +173,17 @@ def test_replay_opens_without_network_and_can_be_made_anew(place, loaded):
     path.unlink()
     again = run("replay", "out", cwd=place)
     assert again.returncode == 0, again.stderr
+    assert again.stderr.strip() == ""  # no notes of Drake's
     assert path.stat().st_size > 100_000
+
+
+def test_replays_of_a_sequence_can_be_made_anew(place, sequence):
+    pages = [place / "sequence" / f"loading_0{k}" / "replay.html" for k in (0, 1)]
+    for page in pages:
+        page.unlink()
+    result = CliRunner().invoke(app, ["replay", str(place / "sequence")])
+    assert result.exit_code == 0, result.output
+    assert all(page.exists() for page in pages)
 
 
 def test_json_prints_only_json_and_the_same_cycle_again(place, loaded):
@@ -219,12 +229,19 @@ def test_pile_command(place, loaded):
         (["pile", "small.yaml", "--set", "pile.emission_height=0.3"], ["pile.rocks", "emission_height"]),
         (["load", "small.yaml", "--plan", "nothing.json"], ["nothing.json", "no such file"]),
         (["load", "small.yaml", "--plan", "bad.yaml"], ["bad.yaml", "not a readable plan"]),
+        (
+            ["load", "small.yaml", "--plan", "bad.json"],
+            ["bad.json", "not a readable plan", "'height_field' is missing"],
+        ),
+        (["load", "small.yaml", "--set", "foo.bar=1"], ["--set", "unknown key 'foo'"]),
+        (["load", "."], ["cannot be read: Is a directory"]),
         (["replay", "nowhere"], ["nowhere", "no such file"]),
         (["machine", "check", "bad.yaml"], ["bad.yaml:2", "drift_widht"]),
     ],
 )
 def test_bad_input_gets_one_message_and_exit_code_two(place, args, parts):
     (place / "bad.yaml").write_text("site:\n  drift_widht: 5\n")
+    (place / "bad.json").write_text("{}")
     (place / "broken.sdf").write_text("<sdf><model>")
     (place / "broken.npz").write_bytes(b"PK\x03\x04 broken")
     result = run(*args, cwd=place)
