@@ -132,14 +132,13 @@ def main() -> None:
                 file.write(json.dumps({"seed": seed, "engine": engine, "rocks": len(pile), **result}) + "\n")
             print(seed, engine, len(pile), {k: round(v, 2) for k, v in result.items()}, flush=True)
     for metric in (*METRICS, "cpu_s"):
-        a, b = (
-            np.array([results[s, engine][metric] for s in range(arguments.seeds)])
-            for engine in engines
-        )
+        a, b = (np.array([results[s, engine][metric] for s in range(arguments.seeds)]) for engine in engines)
         half = stats.t.ppf(0.95, len(a) - 1) * (a - b).std(ddof=1) / np.sqrt(len(a)) if len(a) > 1 else np.nan
         text = f"{metric}: nonsmooth {a.mean():.4g}, {engines[1]} {b.mean():.4g}"
         share = 100 / b.mean()
-        print(f"{text}, difference {share * (a - b).mean():+.1f} ± {share * half:.1f} % (90 %, {len(a)} pairs)")
+        print(
+            f"{text}, difference {share * (a - b).mean():+.1f} ± {share * half:.1f} % (90 %, {len(a)} pairs)"
+        )
 
 
 if __name__ == "__main__":

@@ -13,11 +13,12 @@ import resource
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from drakerock.dynamics.settling import calc_creep, fetch_pile, make_pile, refill
+from drakerock.dynamics.settling import calc_creep, fetch_pile, make_pile, refill, settle
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.pile.emission import calc_level, make_emitter
 from drakerock.pile.shapes import load_rock_shapes
@@ -75,6 +76,22 @@ def bench_refill() -> None:
             f"refill: {removed.sum()} rocks taken {name}, {len(after) - len(pile) + removed.sum()} emitted, level "
             f"{calc_level(pile.select(~removed), emitter):.2f} -> {calc_level(after, emitter):.2f} m, "
             f"{time.process_time() - start:.1f} s CPU"
+        )
+        place = pile.p_WRs[removed].mean(axis=0)
+        near = np.argsort(np.linalg.norm(after.p_WRs - place, axis=1))
+        chosen = near[~after.fixed[near]][:300]
+        resting = ~after.fixed
+        resting[chosen] = False
+        assert after.contacts is not None
+        woken = replace(after, contacts=replace(after.contacts, resting=resting))
+        rest = RECIPE.dynamics.nonsmooth.rest.model_copy(update={"time": 1e9})
+        nonsmooth = RECIPE.dynamics.nonsmooth.model_copy(update={"rest": rest})
+        dynamics = RECIPE.dynamics.model_copy(update={"nonsmooth": nonsmooth})
+        later, _ = settle(woken, SHAPES, RECIPE.model_copy(update={"dynamics": dynamics}), 5.0)
+        moved = 1e3 * np.linalg.norm(later.p_WRs - after.p_WRs, axis=1)[chosen]
+        print(
+            f"refill: the 300 rocks nearest to the hole woken for 5 s: mean {moved.mean():.2f} mm, "
+            f"p99 {np.percentile(moved, 99):.2f} mm, most {moved.max():.0f} mm"
         )
 
 

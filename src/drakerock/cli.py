@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -39,6 +40,7 @@ SeedOption = Annotated[int | None, typer.Option(help="Seed of all randomness.")]
 
 def main() -> None:
     """Run the command line; bad input prints one message and exits with 2, a failed simulation with 1."""
+    logging.getLogger("drake").addFilter(_is_for_users)
     try:
         app()
     except InputError as error:
@@ -54,6 +56,11 @@ def main() -> None:
     except KeyboardInterrupt:
         console.print("interrupted")
         sys.exit(130)
+
+
+def _is_for_users(record: logging.LogRecord) -> bool:
+    """Return False for Drake's notes on how a scene was built and on the server of a page that is only written."""
+    return record.levelno >= logging.WARNING and "half spaces" not in record.getMessage()
 
 
 def _print_error(word: str, error: Exception) -> None:
@@ -107,6 +114,9 @@ def load(
     loadings: Annotated[
         int | None, typer.Option(min=1, help="Run or resume a sequence of so many loadings.")
     ] = None,
+    replay: Annotated[
+        bool, typer.Option(help="Write replay.html, of each loading; about 13 MB at full size.")
+    ] = True,
     figures: Annotated[bool, typer.Option("--figures", help="Write the pictures, too, as PNG.")] = False,
     seed: SeedOption = None,
     set_: SetOption = None,
@@ -115,6 +125,8 @@ def load(
     """Run one loading cycle, or a sequence, and write outcome, signals, piles and replay.
 
     Example: drakerock load studies/demo.yaml --alpha 1.3 --beta 0.85 --out out/load
+
+    Example: drakerock load studies/small.yaml --loadings 5 --figures --out out/five
     """
     from drakerock.study.jobs import run_and_save, run_and_save_sequence
 
@@ -125,7 +137,9 @@ def load(
     config = _load(scenario, seed, [*(set_ or []), *overrides])
     if loadings is not None:
         with _show_progress("load") as advance:
-            summary, paths = run_and_save_sequence(config, loadings, out, advance, figures=figures)
+            summary, paths = run_and_save_sequence(
+                config, loadings, out, advance, replay=replay, figures=figures
+            )
         if json_:
             print(json.dumps(summary))
         else:
@@ -135,7 +149,7 @@ def load(
             raise SimulationFailure(summary["reasons"][-1])
         return
     with _show_progress("load") as advance:
-        result, paths = run_and_save(config, out, advance, figures=figures)
+        result, paths = run_and_save(config, out, advance, replay=replay, figures=figures)
     if json_:
         print(result.to_json(), end="")
     else:
@@ -147,18 +161,23 @@ def load(
 
 @app.command()
 def replay(
-    folder: Annotated[Path, typer.Argument(help="Folder of a finished cycle.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of a finished cycle, or of a sequence.")],
 ) -> None:
-    """Make replay.html anew from a stored recording.
+    """Make replay.html anew from a stored recording; of a sequence, each loading's.
 
     Example: drakerock replay out/load
     """
     from drakerock.loading.recording import load_recording
     from drakerock.viewing.replay import write_replay
 
-    path = folder / "replay.html"
-    write_replay(load_recording(folder / "recording.npz"), path)
-    _print_paths([path])
+    places = sorted(path.parent for path in folder.glob("loading_*/recording.npz"))
+    if (folder / "recording.npz").exists() or not places:
+        places = [folder]
+    with _show_progress("replay") as advance:
+        for number, place in enumerate(places):
+            advance("drawing", number / len(places), note=place.name)
+            write_replay(load_recording(place / "recording.npz"), place / "replay.html")
+    _print_paths([place / "replay.html" for place in places])
 
 
 machine_app = typer.Typer(no_args_is_help=True, help="The machine: its checks and its looks.")
@@ -379,7 +398,7 @@ def _load(path: Path | None, seed: int | None, overrides: list[str] | None) -> A
 
 
 @contextmanager
-def _show_progress(name: str) -> Iterator[Callable[[str, float | None], None]]:
+def _show_progress(name: str) -> Iterator[Callable[..., None]]:
     """Show what is being done on standard error; plain (and silent) when that is not a terminal."""
     columns = (TextColumn("[bold]{task.fields[stage]:<18}"), BarColumn(), TextColumn("{task.fields[note]}"))
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
@@ -409,7 +428,8 @@ def _print_outcome(outcome: Any) -> None:
     table.add_row("debris", show(outcome.objectives["debris"], "{:.0f} kg"))
     mass = show(outcome.bucket_mass_kg, "{:.0f} kg")
     table.add_row("bucket load", f"{mass} in {show(outcome.bucket_rocks, '{:d}')} rocks")
-    table.add_row("weighed", show(outcome.weighed_mass_kg, "{:.0f} kg"))
+    counted = show(outcome.counted_when_weighed_kg, "{:.0f} kg")
+    table.add_row("weighed", f"{show(outcome.weighed_mass_kg, '{:.0f} kg')} (counted then: {counted})")
     table.add_row("loading time t4 - t0", show(outcome.loading_time_s, "{:.2f} s"))
     table.add_row("t0 ... t4", "  ".join(show(t, "{:.2f}") for t in outcome.waypoint_times_s) + " s")
     if "volume_m3" in outcome.plan:
@@ -441,6 +461,7 @@ def _print_sequence(summary: dict[str, Any]) -> None:
         "damage": ("damage", "{:.4f}"),
         "debris": ("debris [kg]", "{:.0f}"),
         "bucket_mass_kg": ("bucket load [kg]", "{:.0f}"),
+        "weighed_mass_kg": ("weighed [kg]", "{:.0f}"),
         "loading_time_s": ("loading time [s]", "{:.2f}"),
         "energy_J": ("motors' work [J]", "{:.3g}"),
         "wall_time_s": ("wall time of a cycle [s]", "{:.1f}"),
@@ -456,6 +477,8 @@ def _print_sequence(summary: dict[str, Any]) -> None:
         values = "  ".join("-" if value is None else form.format(value) for value in row["values"])
         table.add_row(Text(label), *numbers, values)  # text, not markup: the units' brackets stay
     output.print(table)
+    events = ", ".join(f"{name} {count}" for name, count in summary["events"].items()) or "none"
+    output.print(f"events: {events}", soft_wrap=True)
 
 
 def _kilo(value: float | None) -> float | None:

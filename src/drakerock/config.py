@@ -60,7 +60,8 @@ def load_config[ConfigT: Config](
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from None
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: cannot be read: {reason}") from None
     return parse_config(text, schema, overrides, source=str(path), complete=complete)
 
 
@@ -125,10 +126,12 @@ def _describe(
 ) -> str:
     loc: Key = tuple(part for part in item["loc"])
     dotted = ".".join(str(part) for part in loc) or "(top level)"
-    if any(loc[: len(key)] == key for key in overridden):
+    line = _find_line(node, loc)
+    # An unknown room that stands in no file came by an override of a key in it.
+    made = any(key[: len(loc)] == loc for key in overridden) and line is None
+    if made or any(loc[: len(key)] == key for key in overridden):
         where = "--set"
     else:
-        line = _find_line(node, loc)
         where = f"{source}:{line}" if line else source
     if item["type"] == "extra_forbidden":
         allowed = _list_fields(schema, loc[:-1])

@@ -109,13 +109,13 @@ def sequence(place):
     args = ["load", str(place / "small.yaml"), "--set", "dynamics.rocks=nonsmooth", "--alpha", "0.4"]
     args += ["--out", str(place / "sequence")]
     return [
-        CliRunner().invoke(app, [*args, *more])
-        for more in (["--loadings", "1"], ["--loadings", "2", "--figures"])
+        (CliRunner().invoke(app, [*args, *more]), sorted(path.name for path in place.glob("sequence/*/*")))
+        for more in (["--loadings", "1", "--no-replay"], ["--loadings", "2", "--figures"])
     ]
 
 
 def test_sequence_writes_loadings_and_summary_and_goes_on(place, sequence):
-    first, second = sequence
+    (first, _), (second, _) = sequence
     assert first.exit_code == 0, first.output
     assert second.exit_code == 0, second.output
     assert "standard error" in second.stdout
@@ -133,6 +133,13 @@ def test_sequence_writes_loadings_and_summary_and_goes_on(place, sequence):
     assert row["values"] == productions
     assert row["mean"] == pytest.approx(np.mean(productions))
     assert row["standard_error"] == pytest.approx(np.std(productions, ddof=1) / np.sqrt(2))
+
+
+def test_each_loading_of_a_sequence_has_its_replay_unless_not_wanted(place, sequence):
+    (_, without), (_, both) = sequence
+    assert "outcome.json" in without
+    assert "replay.html" not in without
+    assert both.count("replay.html") == both.count("outcome.json") == 2
 
 
 def test_figures_and_resolved_scenario_are_written(place, sequence):
@@ -166,7 +173,17 @@ def test_replay_opens_without_network_and_can_be_made_anew(place, loaded):
     path.unlink()
     again = run("replay", "out", cwd=place)
     assert again.returncode == 0, again.stderr
+    assert again.stderr.strip() == ""  # no notes of Drake's
     assert path.stat().st_size > 100_000
+
+
+def test_replays_of_a_sequence_can_be_made_anew(place, sequence):
+    pages = [place / "sequence" / f"loading_0{k}" / "replay.html" for k in (0, 1)]
+    for page in pages:
+        page.unlink()
+    result = CliRunner().invoke(app, ["replay", str(place / "sequence")])
+    assert result.exit_code == 0, result.output
+    assert all(page.exists() for page in pages)
 
 
 def test_json_prints_only_json_and_the_same_cycle_again(place, loaded):
@@ -212,12 +229,19 @@ def test_pile_command(place, loaded):
         (["pile", "small.yaml", "--set", "pile.emission_height=0.3"], ["pile.rocks", "emission_height"]),
         (["load", "small.yaml", "--plan", "nothing.json"], ["nothing.json", "no such file"]),
         (["load", "small.yaml", "--plan", "bad.yaml"], ["bad.yaml", "not a readable plan"]),
+        (
+            ["load", "small.yaml", "--plan", "bad.json"],
+            ["bad.json", "not a readable plan", "'height_field' is missing"],
+        ),
+        (["load", "small.yaml", "--set", "foo.bar=1"], ["--set", "unknown key 'foo'"]),
+        (["load", "."], ["cannot be read: Is a directory"]),
         (["replay", "nowhere"], ["nowhere", "no such file"]),
         (["machine", "check", "bad.yaml"], ["bad.yaml:2", "drift_widht"]),
     ],
 )
 def test_bad_input_gets_one_message_and_exit_code_two(place, args, parts):
     (place / "bad.yaml").write_text("site:\n  drift_widht: 5\n")
+    (place / "bad.json").write_text("{}")
     (place / "broken.sdf").write_text("<sdf><model>")
     (place / "broken.npz").write_bytes(b"PK\x03\x04 broken")
     result = run(*args, cwd=place)

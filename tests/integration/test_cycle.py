@@ -29,7 +29,12 @@ def test_modes_run_in_order_and_the_load_is_weighed(result):
     assert np.all(np.diff(modes) >= 0)
     assert {int(mode) for mode in modes} >= {Mode.APPROACH, Mode.S0, Mode.S1, Mode.S2, Mode.S3, Mode.DONE}
     outcome = result.outcome
-    assert outcome.weighed_mass_kg == pytest.approx(outcome.bucket_mass_kg, abs=150)
+    assert outcome.weighed_mass_kg == pytest.approx(outcome.counted_when_weighed_kg, abs=50)
+    performance = result.scenario.loading.performance
+    late = performance.weighing_delay + performance.weighing_time
+    assert outcome.sim_time_s >= outcome.waypoint_times_s[4] + late - 1e-9
+    changed = [item["mass_kg"] for item in outcome.events if item["event"] == "load changed after s4"]
+    assert outcome.counted_when_weighed_kg == pytest.approx(outcome.bucket_mass_kg + sum(changed))
 
 
 def test_bucket_forces_lift_the_load(result):

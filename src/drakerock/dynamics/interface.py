@@ -36,6 +36,9 @@ class RockSystem(Protocol):
     def GetOutputPort(self, port_name: str) -> OutputPort:
         """Return the port of that name."""
 
+    def GetMyContextFromRoot(self, root_context: Context) -> Context:
+        """Return the system's own context in a Diagram's."""
+
     def set_pile(self, root_context: Context, pile: PileState) -> None:
         """Write the rocks' poses and velocities into the Diagram's context."""
 

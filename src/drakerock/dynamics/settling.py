@@ -35,6 +35,7 @@ from drakerock.pile.emission import (
 from drakerock.pile.shapes import RockShape, load_rock_shapes
 from drakerock.pile.site import Site, make_confined_site, make_site
 from drakerock.pile.state import PileState, load_pile, make_empty_pile, save_pile
+from drakerock.pile.summary import calc_imbalance, calc_support
 from drakerock.randomness import make_generator
 from drakerock.resources import find_data
 
@@ -44,8 +45,25 @@ Progress = Callable[[str, float], None]
 
 # The void is full when its level has stayed at the emitter for so many batches: rocks still flow out.
 FULL_BATCHES = 4
-# So many batches without room for a single rock: it will never find any.
+# So many batches without room for a single rock, and it is the others' turn.
 MISSED_BATCHES = 20
+# A batch is complete when so many rocks have found no room.
+EMITTER_MISSES = 5
+MANY_MISSES = 500
+# In a pile's provenance: shapes and sizes of rocks that a refill had no room for; they come first in the next.
+WAITING = "waiting_rocks"
+# The forces of a pile balance when site and static rocks carry its weight to within this share, and 90 % of the
+# rocks' own contacts theirs to within that; looked at every so often [s].
+CARRIED_TOLERANCE = 0.003
+IMBALANCE_P90 = 0.03
+BALANCE_WINDOW = 0.1
+# Rocks that are set off by all being awake have so long to fall [s]; then all are kept awake again, at most so often,
+# and not when they were so small a share of the rocks that the others' balance stays.
+FALL_TIME = 5.0
+# A rock that no longer falls may go on so fast in its hole, on average [m/s].
+RATTLE_SPEED = 0.1
+BALANCE_ROUNDS = 5
+FEW_SHARE = 0.002
 
 
 class PileRecipe(Config):
@@ -66,6 +84,8 @@ def settle(
     *,
     site: Site | None = None,
     until_rest: bool = False,
+    until: Callable[[PileState], bool] | None = None,
+    window: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[PileState, bool]:
     """Simulate rocks in the site, without a machine.
@@ -77,7 +97,9 @@ def settle(
         duration: longest simulated time [s].
         site: the surroundings, if not the recipe's.
         until_rest: stop as soon as 99 % of the moving rocks moved less than settle_speed * settle_window over
-            the last settle_window.
+            the last settle_window, or all but one that rattles in its hole.
+        until: stop as soon as this holds of the pile.
+        window: how often to look [s], if not every settle_window.
         progress: called with the share of the duration done.
 
     Returns:
@@ -88,20 +110,27 @@ def settle(
     """
     advance = _make_plant_advance if recipe.dynamics.rocks == "plant" else _make_nonsmooth_advance
     advance_to = advance(pile, shapes, recipe, site or make_site(recipe.site))
-    window, resting, time = recipe.pile.settle_window, False, 0.0
+    window, resting, time = window or recipe.pile.settle_window, False, 0.0
     before = pile
-    while time < duration - 1e-9 and not (until_rest and resting):
+    while time < duration - 1e-9 and not (until_rest and resting) and not (time and until and until(before)):
         time = min(time + window, duration)
         try:
             after = advance_to(time)
         except RuntimeError as error:
             raise SimulationFailure(f"settling the pile failed at {time:.2f} s: {error}") from None
         moved = np.linalg.norm(after.p_WRs - before.p_WRs, axis=1)[~pile.fixed]
-        resting = bool(len(moved) == 0 or np.percentile(moved, 99) < recipe.pile.settle_speed * window)
+        resting = _is_resting(moved / window, recipe.pile.settle_speed)
         before = after
         if progress:
             progress(time / duration)
     return before, resting
+
+
+def _is_resting(speeds: NDArray[np.float64], limit: float) -> bool:
+    """Return whether 99 % of the rocks are slower than the limit [m/s]; a single one may rattle in its hole."""
+    if len(speeds) == 0 or np.percentile(speeds, 99) < limit:
+        return True
+    return bool(np.sum(speeds >= limit) == 1 and speeds.max() < RATTLE_SPEED)
 
 
 def calc_creep(
@@ -179,7 +208,7 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
         waiting = sample_rocks(_count_filling(recipe, site.rear_layer), recipe.rocks, shapes, rng)
         emitter = make_rear_emitter(site, recipe.pile)
         mould = make_confined_site(site)
-        layer = drop_rocks(
+        layer, _ = drop_rocks(
             waiting, pile, shapes, recipe, emitter, rng, until_full=True, site=mould, stage="rear wall",
             progress=progress,
         )  # fmt: skip
@@ -188,7 +217,15 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
     number = n or _count_filling(recipe, site.void_depth + 1.5 * site.drift_height)
     waiting = sample_rocks(number, recipe.rocks, shapes, rng)
     emitter = make_emitter(site, recipe.pile)
-    pile = drop_rocks(waiting, pile, shapes, recipe, emitter, rng, until_full=n is None, progress=progress)
+    pile, left = drop_rocks(
+        waiting, pile, shapes, recipe, emitter, rng, until_full=n is None, progress=progress
+    )
+    if n is not None and len(left):
+        raise InputError(
+            f"pile.rocks: only {n - len(left)} of {n} rocks find room in the emitter, "
+            f"{np.round(emitter.high - emitter.low, 2).tolist()} m; raise pile.emission_height, "
+            "pile.emission_reach or pile.emission_interval, widen the site, or ask for fewer rocks"
+        )
     # The pile starts as a sequence leaves it after each loading: without loose rocks on the floor.
     pile = pile.select(pile.fixed | ~find_loose(pile, shapes, recipe.pile.contact_gap))
     provenance = {
@@ -216,11 +253,15 @@ def drop_rocks(
     rng: np.random.Generator,
     *,
     until_full: bool = False,
+    until_balanced: bool = False,
     site: Site | None = None,
     stage: str = "dropping rocks",
     progress: Progress | None = None,
-) -> PileState:
+) -> tuple[PileState, PileState]:
     """Emit rocks in batches from above onto a pile, and let all come to rest.
+
+    Where rocks have found no room for some batches, all that wait are tried, not only the first of them; if still
+    none finds room, emission ends.
 
     Args:
         waiting: the rocks to emit, in this order, at drawn turns and places.
@@ -231,31 +272,28 @@ def drop_rocks(
         rng: source of the turns and places.
         until_full: emit only while the pile's level is below the emitter, and stop when it stays there, whatever
             still waits.
+        until_balanced: at the end, keep all rocks awake no longer than until their forces balance; else for
+            `pile.balance_time`.
         site: the surroundings, if not the recipe's.
         stage: what to call it in the progress.
         progress: called as things proceed.
 
     Returns:
-        The pile at rest, the emitted rocks last, in the order in which they found room.
+        The pile at rest, the emitted rocks last, in the order in which they found room; and those that still wait.
 
     Raises:
-        InputError: a rock finds no room in the emitter.
         SimulationFailure: the dynamics failed, or the pile did not come to rest in time.
     """
-    total, missed, full = len(waiting), 0, 0
-    while len(waiting) and full < FULL_BATCHES:
+    total, missed, full, misses = len(waiting), 0, 0, EMITTER_MISSES
+    while len(waiting) and full < FULL_BATCHES and missed <= MISSED_BATCHES:
         level = calc_level(pile, emitter)
         full = full + 1 if until_full and level >= emitter.low[2] else 0
         if not full:
-            placed, waiting = place_rocks(waiting, pile, shapes, emitter, rng)
+            if missed == MISSED_BATCHES:
+                misses = MANY_MISSES
+            placed, waiting = place_rocks(waiting, pile, shapes, emitter, rng, misses=misses)
             missed = 0 if len(placed) else missed + 1
             pile = pile.join(placed)
-        if missed > MISSED_BATCHES and not until_full:
-            raise InputError(
-                f"pile.rocks: only {total - len(waiting)} of {total} rocks find room in the emitter, "
-                f"{np.round(emitter.high - emitter.low, 2).tolist()} m; raise pile.emission_height, "
-                "pile.emission_reach or pile.emission_interval, widen the site, or ask for fewer rocks"
-            )
         pile, _ = settle(pile, shapes, recipe, emitter.interval, site=site)
         if progress:
             share = level / emitter.low[2] if until_full else 1.0 - len(waiting) / total
@@ -267,24 +305,59 @@ def drop_rocks(
     if not resting:
         raise SimulationFailure(f"the pile did not come to rest within {recipe.pile.max_time:g} s")
     if pile.contacts is not None:
-        pile = _balance(pile, shapes, recipe, site)
-    return replace(pile, V_WRs=np.zeros_like(pile.V_WRs))
+        pile = _balance(pile, shapes, recipe, site, until_balanced)
+    return replace(pile, V_WRs=np.zeros_like(pile.V_WRs)), waiting
 
 
 def _balance(
-    pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe, site: Site | None
+    pile: PileState,
+    shapes: tuple[RockShape, ...],
+    recipe: PileRecipe,
+    site: Site | None,
+    until_balanced: bool,
 ) -> PileState:
-    """Return a settled pile with its contact forces in balance with the weights, all rocks resting.
+    """Return a settled pile with its contact forces in balance with the weights, and its rocks at rest.
 
     Rocks come to rest one after the other, each with the forces of that moment, which later rest changes. So all
-    are kept awake for a while at the end.
+    are kept awake for a while at the end; with `until_balanced` no longer than until the forces balance. A rock that
+    this sets off falls and comes to rest before all are kept awake again.
     """
     nonsmooth = recipe.dynamics.nonsmooth.model_copy(update={"reduction": "none"})
     dynamics = recipe.dynamics.model_copy(update={"nonsmooth": nonsmooth})
     awake = recipe.model_copy(update={"dynamics": dynamics})
-    pile, _ = settle(pile, shapes, awake, recipe.pile.balance_time, site=site)
-    assert pile.contacts is not None
-    return replace(pile, contacts=replace(pile.contacts, resting=~pile.fixed))
+    surroundings, time_step = site or make_site(recipe.site), recipe.dynamics.time_step
+
+    def is_balanced(pile: PileState) -> bool:
+        support = calc_support(pile, shapes, recipe.rocks, surroundings, time_step)
+        if support is None or support.weight == 0.0:
+            return True
+        carried = (support.floor + support.walls + support.static) / support.weight
+        imbalance = calc_imbalance(pile, shapes, recipe.rocks, time_step)
+        return bool(abs(carried - 1.0) < CARRIED_TOLERANCE and np.percentile(imbalance, 90) < IMBALANCE_P90)
+
+    def find_fast(pile: PileState) -> NDArray[np.bool_]:
+        fast: NDArray[np.bool_] = (
+            np.linalg.norm(pile.V_WRs[:, 3:], axis=1) > recipe.dynamics.nonsmooth.rest.speed
+        )
+        return fast & ~pile.fixed
+
+    few = FEW_SHARE * len(pile)
+    for _ in range(BALANCE_ROUNDS):
+        pile, _ = settle(
+            pile, shapes, awake, recipe.pile.balance_time, site=site,
+            until=is_balanced if until_balanced else None, window=BALANCE_WINDOW if until_balanced else None,
+        )  # fmt: skip
+        assert pile.contacts is not None
+        fast = find_fast(pile)
+        pile = replace(pile, contacts=replace(pile.contacts, resting=~pile.fixed & ~fast))
+        if fast.any():
+            # A rock may rattle in its hole for good, which does not count as falling.
+            pile, _ = settle(
+                pile, shapes, recipe, FALL_TIME, site=site, until=lambda pile: not find_fast(pile).any()
+            )
+        if fast.sum() <= few:
+            break
+    return pile
 
 
 def refill(
@@ -297,8 +370,9 @@ def refill(
     """Return the pile without the removed rocks, new ones emitted from above until its level is restored, at rest.
 
     The new rocks have the removed ones' shapes and sizes, so that the gradation stays over a long sequence. With
-    `pile.rocks` set, all are emitted and their number stays too. With null, the void is filled to the emitter again:
-    none is emitted while the void's level has not sunk, and further ones are drawn when the pile has slid.
+    `pile.rocks` set, all are emitted and their number stays too; those that find no room, because the pile reaches
+    up to the emitter, wait for the next refill (in the provenance). With null, the void is filled to the emitter
+    again: none is emitted while the void's level has not sunk, and further ones are drawn when the pile has slid.
 
     Args:
         pile: all rocks, the removed ones among them.
@@ -308,14 +382,41 @@ def refill(
         rng: source of the further rocks, the turns and places.
 
     Raises:
-        SimulationFailure, InputError: as `drop_rocks`.
+        SimulationFailure: as `drop_rocks`.
     """
     waiting, until_full = replace(pile.select(removed), contacts=None), recipe.pile.rocks is None
+    if WAITING in pile.provenance:
+        waiting = _make_waiting(**pile.provenance[WAITING]).join(waiting)
     if until_full:
         number = _count_filling(recipe, recipe.site.void_depth)
         waiting = waiting.join(sample_rocks(number, recipe.rocks, shapes, rng))
     emitter = make_emitter(recipe.site, recipe.pile)
-    return drop_rocks(waiting, pile.select(~removed), shapes, recipe, emitter, rng, until_full=until_full)
+    after, left = drop_rocks(
+        waiting,
+        pile.select(~removed),
+        shapes,
+        recipe,
+        emitter,
+        rng,
+        until_full=until_full,
+        until_balanced=True,
+    )
+    provenance = {key: value for key, value in pile.provenance.items() if key != WAITING}
+    if len(left) and not until_full:
+        provenance[WAITING] = {"shape": left.shape.tolist(), "size": left.size.tolist()}
+    return replace(after, provenance=provenance)
+
+
+def _make_waiting(shape: list[int], size: list[float]) -> PileState:
+    n = len(size)
+    return PileState(
+        p_WRs=np.zeros((n, 3)),
+        q_WRs=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        V_WRs=np.zeros((n, 6)),
+        shape=np.array(shape, np.int64),
+        size=np.array(size, float),
+        fixed=np.zeros(n, bool),
+    )
 
 
 def fetch_pile(recipe: PileRecipe, progress: Progress | None = None) -> tuple[PileState, Path]:

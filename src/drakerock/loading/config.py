@@ -99,8 +99,14 @@ class PerformanceConfig(Config):
     ] = 0.05
     rest_window: Annotated[float, Field(gt=0, le=10, description="... over this time [s]")] = 0.5
     weighing_delay: Annotated[
-        float, Field(ge=0, le=10, description="after s4, until the braked machine's weight is read [s]")
+        float, Field(ge=0, le=10, description="after s4, until the braked machine is weighed [s]")
+    ] = 0.3
+    weighing_time: Annotated[
+        float, Field(ge=0.1, le=10, description="the weight is the mean over this time: the load rocks [s]")
     ] = 0.5
+    weighing_tolerance: Annotated[
+        float, Field(gt=0, description="weight and counted load that differ by more are an event [kg]")
+    ] = 150.0
     stall_speed: Annotated[
         float, Field(gt=0, description="stall: slower than this while told to drive on [m/s]")
     ] = 0.05

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time as clock
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,15 @@ from drakerock.errors import SimulationFailure
 from drakerock.files import make_folder, write_text
 from drakerock.loading.control import TIMEOUTS, WAYPOINT_TIMES, Mode
 from drakerock.loading.field import HeightField
-from drakerock.loading.performance import calc_damage, find_bucket_load, find_debris, find_events, find_lost
+from drakerock.loading.performance import (
+    Weighing,
+    calc_damage,
+    find_bucket_load,
+    find_debris,
+    find_events,
+    find_lost,
+    find_weighing_events,
+)
 from drakerock.loading.plan import DigPlan, NoPlan
 from drakerock.loading.plan_file import save_plan
 from drakerock.loading.recording import Recorder, Recording, save_recording
@@ -49,13 +57,15 @@ class CycleOutcome:
         strategy: alpha, beta, gamma, kappa.
         bucket_mass_kg, bucket_rocks: the load at t4.
         weighed_mass_kg: the machine's weight on the floor as it stands after t4, less its own: what rocks it
-            carries, a cross-check of the load; null where it never stood still.
+            carries, a cross-check of the load; null where it did not come to that.
+        counted_when_weighed_kg: the bucket's load by geometry at that time, t4 plus weighing delay and time.
         loading_time_s: t4 - t0.
         waypoint_times_s: t0 to t4; null where not passed.
         plan: swept and wanted volume, whether the wanted one could be reached, entry point, slope, dig height.
         peak_push_force_N, mean_push_force_N: of the rocks against the bucket's motion into the pile.
         energy_J: the motors' work over [t0, t4].
-        events: stalls, slips, time-outs, and rocks that still moved when debris was counted, with their times.
+        events: stalls, slips, time-outs, a load that changed after s4 or differs from its weight, and rocks
+            that still moved when debris was counted, with their times.
         rocks: number in all, awake at most and on average.
         wall_time_s, sim_time_s, steps, ms_per_step: cost of the cycle.
         files: names of the files with the planned and the actual tip path.
@@ -72,6 +82,7 @@ class CycleOutcome:
     bucket_mass_kg: float | None
     bucket_rocks: int | None
     weighed_mass_kg: float | None
+    counted_when_weighed_kg: float | None = field(default=None, kw_only=True)
     loading_time_s: float | None
     waypoint_times_s: list[float | None]
     plan: dict[str, Any]
@@ -166,8 +177,15 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
     mode_port = station.diagram.GetOutputPort("mode")
     progress_port = station.diagram.GetOutputPort("progress")
     rock_port = station.diagram.GetOutputPort("rock_poses")
-    failure, weighed_at = None, None
-    floor_forces: list[float] = []
+    rock_force_port = station.rocks.GetOutputPort("F_B_W")
+    rocks_context = station.rocks.GetMyContextFromRoot(root)
+    failure: str | None = None
+    t4: float | None = None
+    weighing: Weighing | None = None
+    floor_forces, bucket_forces = list[float](), list[float]()
+    volumes = np.array([shape.volume for shape in station.shapes])
+    masses = pile.calc_masses(volumes, scenario.rocks.density)
+    gravity = float(-station.plant.gravity_field().gravity_vector()[2])
 
     def record() -> Mode:
         mode = Mode(int(mode_port.Eval(root)[0]))
@@ -182,39 +200,56 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
             return EventStatus.DidNothing()
         return EventStatus.ReachedTermination(station.controller, "s4")
 
+    def weigh(root_context: Context) -> EventStatus:
+        assert t4 is not None
+        since = root_context.get_time() - t4
+        if 0.0 <= since - performance.weighing_delay <= performance.weighing_time:
+            floor_forces.append(_calc_floor_force(station, plant_context))
+            bucket_forces.append(-float(rock_force_port.Eval(rocks_context)[5]))
+        return EventStatus.DidNothing()
+
+    def finish_weighing(pile: PileState) -> Weighing:
+        own = station.plant.CalcTotalMass(plant_context, [station.machine.instance])
+        return Weighing(
+            time_s=root.get_time(),
+            weight_kg=float(np.mean(floor_forces)) / gravity - own,
+            on_bucket_kg=float(np.mean(bucket_forces)) / gravity,
+            counted_kg=float(masses[find_load(pile)].sum()),
+        )
+
     def find_load(pile: PileState) -> NDArray[np.bool_]:
         bucket = station.plant.GetBodyByName("bucket", station.machine.instance)
         return find_bucket_load(pile, station.digger.bucket, bucket.EvalPoseInWorld(plant_context))
 
     record()
     load, at_rest = np.zeros(len(pile), bool), True
-    pile_at_t4 = last_pile = pile
+    last_pile = pile
     simulator.set_monitor(stop_at_s4)
     frame, last_check = 0, 0.0
     try:
         while not isinstance(plan, NoPlan):
             frame += 1
             simulator.AdvanceTo(frame / scenario.recording.frame_rate)
-            if weighed_at is None and mode_port.Eval(root)[0] >= Mode.DONE:
-                simulator.clear_monitor()
-                weighed_at = last_check = root.get_time()
-                pile_at_t4 = last_pile = station.rocks.get_pile(root)
-                load = find_load(pile_at_t4)
+            if t4 is None and mode_port.Eval(root)[0] >= Mode.DONE:
+                t4 = last_check = root.get_time()
+                at_rest = False
+                last_pile = station.rocks.get_pile(root)
+                load = find_load(last_pile)
+                simulator.set_monitor(weigh)
                 simulator.AdvanceTo(frame / scenario.recording.frame_rate)
             record()
-            if weighed_at is None:
+            if t4 is None:
                 continue
             time = root.get_time()
-            if time - weighed_at >= performance.weighing_delay:
-                floor_forces.append(_calc_floor_force(station, plant_context))
+            if weighing is None and time - t4 >= performance.weighing_delay + performance.weighing_time:
+                weighing = finish_weighing(station.rocks.get_pile(root))
             if time - last_check >= performance.rest_window - 1e-9:
                 now = station.rocks.get_pile(root)
                 moved = np.linalg.norm(now.p_WRs - last_pile.p_WRs, axis=1)[~load]
                 at_rest = bool(np.all(moved < performance.rest_speed * (time - last_check)))
                 last_check, last_pile = time, now
-                late = time - weighed_at >= performance.settle_time
-                if floor_forces and (at_rest or late):
-                    break
+            if weighing and (at_rest or time - t4 >= performance.settle_time):
+                break
     except (RuntimeError, SimulationFailure) as error:
         failure = f"solver failure at {root.get_time():.2f} s: {error}"
 
@@ -222,18 +257,13 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
     signals, units = calc_signals(station, root)
     controller = np.array(progress_port.Eval(root))
     in_bucket, debris = load, np.zeros(len(pile), bool)
-    if weighed_at is not None and failure is None:
+    if t4 is not None and failure is None:
         in_bucket = load | find_load(pile_after)
         gone = in_bucket | find_lost(pile_after, scenario.site)
         debris = find_debris(pile_after, station.shapes, gone, scenario.pile.contact_gap)
 
-    weighed = None
-    if floor_forces:
-        gravity = float(-station.plant.gravity_field().gravity_vector()[2])
-        own = station.plant.CalcTotalMass(plant_context, [station.machine.instance])
-        weighed = float(np.mean(floor_forces)) / gravity - own
     outcome = _make_outcome(
-        scenario, station, pile_at_t4, plan, controller, signals, load, debris, weighed, failure, at_rest,
+        scenario, plan, controller, signals, masses, load, debris, weighing, failure, at_rest,
         wall_time=clock.perf_counter() - start,
     )  # fmt: skip
     recording = recorder.finish(
@@ -313,20 +343,17 @@ def _calc_floor_force(station: Station, plant_context: Any) -> float:
 
 def _make_outcome(
     scenario: Scenario,
-    station: Station,
-    pile: PileState,
     plan: DigPlan | NoPlan,
     controller: Array,
     signals: dict[str, Array],
+    masses: Array,
     in_bucket: NDArray[np.bool_],
     debris: NDArray[np.bool_],
-    weighed: float | None,
+    weighing: Weighing | None,
     failure: str | None,
     at_rest: bool,
     wall_time: float,
 ) -> CycleOutcome:
-    volumes = np.array([shape.volume for shape in station.shapes])
-    masses = pile.calc_masses(volumes, scenario.rocks.density)
     times = controller[WAYPOINT_TIMES]
     time = signals["time"]
     load = float(masses[in_bucket].sum())
@@ -352,8 +379,11 @@ def _make_outcome(
         )
     config = scenario.loading
     events = find_events(signals, controller[TIMEOUTS], times, config.performance, config.planning.v_x_max)
-    if not at_rest:
+    if weighing:
+        events += find_weighing_events(weighing, load, config.performance.weighing_tolerance)
+    if not at_rest and failure is None:
         events.append({"event": "rocks not at rest", "time_s": float(time[-1])})
+    events.sort(key=lambda item: item["time_s"])
     steps = max(len(time) - 1, 0)
     planned: dict[str, Any]
     if isinstance(plan, DigPlan):
@@ -379,7 +409,8 @@ def _make_outcome(
         strategy=scenario.loading.strategy.model_dump(),
         bucket_mass_kg=load if phi else None,
         bucket_rocks=int(in_bucket.sum()) if phi else None,
-        weighed_mass_kg=weighed,
+        weighed_mass_kg=weighing.weight_kg if weighing else None,
+        counted_when_weighed_kg=weighing.counted_kg if weighing else None,
         loading_time_s=loading_time,
         waypoint_times_s=[float(t) if np.isfinite(t) else None for t in times],
         plan=planned,
@@ -388,7 +419,7 @@ def _make_outcome(
         energy_J=energy,
         events=events,
         rocks={
-            "total": len(pile),
+            "total": len(masses),
             "awake_max": int(signals["n_awake"].max()) if len(time) else 0,
             "awake_mean": float(signals["n_awake"].mean()) if len(time) else 0.0,
         },

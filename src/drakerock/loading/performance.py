@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,54 @@ def calc_damage(time: Array, moment: Array, start: float, end: float, config: Pe
     step = float(np.median(np.diff(time)))
     inside = (time >= start - 1e-9) & (time < end - 1e-9)
     return float(np.sum(excess[inside]) * step / config.t_char)
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """The standing machine on a scale, some time after s4.
+
+    Attributes:
+        time_s: when it ended.
+        weight_kg: the floor's force on the machine less its own weight, over g: all that it carries.
+        on_bucket_kg: the rocks' downward force on the bucket, over g.
+        counted_kg: what lay in the bucket then, by geometry.
+    """
+
+    time_s: float
+    weight_kg: float
+    on_bucket_kg: float
+    counted_kg: float
+
+
+def find_weighing_events(weighing: Weighing, load: float, tolerance: float) -> list[dict[str, Any]]:
+    """Return events for a load that changed after s4, and for one that differs from the weight.
+
+    Args:
+        weighing: the cross-check.
+        load: mass counted at s4 [kg].
+        tolerance: smallest difference that is an event [kg].
+
+    Returns:
+        ``load changed after s4`` with ``mass_kg`` (below 0: lost); ``load and weight differ`` with ``difference_kg``
+        (counted less weighed) and ``cause``.
+    """
+    events: list[dict[str, Any]] = []
+    if abs(weighing.counted_kg - load) > 1e-6:
+        change = weighing.counted_kg - load
+        events.append({"event": "load changed after s4", "time_s": weighing.time_s, "mass_kg": change})
+    difference = weighing.counted_kg - weighing.weight_kg
+    if abs(difference) > tolerance:
+        held = weighing.counted_kg - weighing.on_bucket_kg
+        elsewhere = weighing.weight_kg - weighing.on_bucket_kg
+        if abs(elsewhere) > abs(held):
+            cause = "rocks bear on other parts of the machine than the bucket"
+        elif held > 0:
+            cause = "the pile holds up part of the load"
+        else:
+            cause = "rocks that are not in the bucket bear on it"
+        event = {"event": "load and weight differ", "time_s": weighing.time_s, "difference_kg": difference}
+        events.append(event | {"cause": cause})
+    return events
 
 
 def find_lost(pile: PileState, site: SiteConfig) -> NDArray[np.bool_]:

@@ -45,5 +45,9 @@ def load_plan(path: str | Path) -> tuple[DigPlan | NoPlan, HeightField]:
         return (NoPlan(data["reason"]) if "reason" in data else DigPlan.from_dict(data)), field
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not a readable plan: {error!r}") from None
+    except KeyError as error:
+        raise InputError(f"{path}: not a readable plan: {error} is missing") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path}: not a readable plan: {error}") from None

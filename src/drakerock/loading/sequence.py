@@ -24,7 +24,12 @@ NEXT_PILE = "pile_next.npz"
 
 
 def run_sequence(
-    scenario: Scenario, n_loadings: int, folder: Path, *, progress: SequenceProgress | None = None
+    scenario: Scenario,
+    n_loadings: int,
+    folder: Path,
+    *,
+    progress: SequenceProgress | None = None,
+    finished: Callable[[Path], None] | None = None,
 ) -> list[CycleOutcome]:
     """Run loadings from the scenario's pile: weigh, clean, refill, relax, sense and plan anew.
 
@@ -38,6 +43,7 @@ def run_sequence(
         n_loadings: how many.
         folder: where the loadings' subfolders are.
         progress: called as things proceed.
+        finished: called with each loading's subfolder once it is complete, also if it was before.
 
     Returns:
         The outcomes, fewer than `n_loadings` after a failure.
@@ -57,6 +63,8 @@ def run_sequence(
             done = _run_loading(scenario, pile, number, place, progress)
         outcome, pile = done
         outcomes.append(outcome)
+        if finished:
+            finished(place)
         if outcome.status == "failed":
             break
     return outcomes

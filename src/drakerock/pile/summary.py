@@ -129,6 +129,33 @@ def calc_support(
     )
 
 
+def calc_imbalance(
+    pile: PileState, shapes: tuple[RockShape, ...], rocks: RocksConfig, time_step: float
+) -> Array:
+    """Return each moving rock's (m,) sum of contact forces and weight, over its weight: 0 in balance.
+
+    Args:
+        pile: at rest, with its contacts.
+        shapes: the rock shapes.
+        rocks: density.
+        time_step: of the simulation that the contact impulses come from [s].
+
+    Raises:
+        ValueError: a pile without stored contacts.
+    """
+    if pile.contacts is None:
+        raise ValueError("the pile has no contacts")
+    weights = 9.81 * pile.calc_masses(np.array([shape.volume for shape in shapes]), rocks.density)
+    first, second = pile.contacts.pairs.T
+    forces = pile.contacts.impulses.astype(float) / time_step
+    sums = np.zeros((len(pile), 3))
+    np.subtract.at(sums, first, forces)
+    np.add.at(sums, second[second >= 0], forces[second >= 0])
+    sums[:, 2] -= weights
+    share: Array = np.linalg.norm(sums, axis=1) / weights
+    return share[~pile.fixed]
+
+
 def calc_gradation(
     pile: PileState, shapes: tuple[RockShape, ...], rocks: RocksConfig
 ) -> list[dict[str, float]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from drakerock.dynamics.settling import calc_creep, fetch_pile
 from drakerock.exploration.noise import calc_standard_error
 from drakerock.files import make_folder, write_text
 from drakerock.loading.cycle import CycleOutcome, run_cycle, save_cycle
+from drakerock.loading.recording import load_recording
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.loading.sequence import run_sequence
 from drakerock.pile.shapes import load_rock_shapes
@@ -39,7 +41,12 @@ def get_pile(scenario: Scenario, progress: Callable[..., None] | None = None) ->
 
 
 def run_and_save(
-    scenario: Scenario, folder: Path, progress: Callable[..., None], *, figures: bool = False
+    scenario: Scenario,
+    folder: Path,
+    progress: Callable[..., None],
+    *,
+    replay: bool = True,
+    figures: bool = False,
 ) -> tuple[CycleOutcome, list[Path]]:
     """Get the pile, run the cycle, write its files and the replay.
 
@@ -47,6 +54,7 @@ def run_and_save(
         scenario: the configuration.
         folder: where to write.
         progress: called with stage, share in [0, 1] or None, and a note.
+        replay: whether to write replay.html.
         figures: whether to write the pictures, too.
 
     Raises:
@@ -60,9 +68,11 @@ def run_and_save(
     )
     progress("writing", None)
     paths = save_cycle(result, folder)
+    (folder / "replay.html").unlink(missing_ok=True)  # an earlier cycle's
     if result.recording is not None:
-        write_replay(result.recording, folder / "replay.html")
-        paths.append(folder / "replay.html")
+        if replay:
+            write_replay(result.recording, folder / "replay.html")
+            paths.append(folder / "replay.html")
         if figures:
             progress("drawing", None)
             paths += write_cycle_figures(folder)
@@ -75,6 +85,7 @@ def run_and_save_sequence(
     folder: Path,
     progress: Callable[..., None],
     *,
+    replay: bool = True,
     figures: bool = False,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Run or resume a sequence of loadings, and write its summary.
@@ -84,6 +95,7 @@ def run_and_save_sequence(
         n_loadings: how many.
         folder: where to write: loading_00, loading_01, ... with a cycle's files each, and sequence.json.
         progress: called with stage, share in [0, 1] or None, and a note.
+        replay: whether to write each loading's replay.html, as soon as it is complete.
         figures: whether to write each loading's pictures, too.
 
     Returns:
@@ -98,19 +110,26 @@ def run_and_save_sequence(
         note = f"loading {number + 1} of {n_loadings}, {time:.1f} s simulated"
         progress(stage, number / n_loadings, note=note)
 
-    outcomes = run_sequence(scenario, n_loadings, folder, progress=tell)
-    places = [folder / f"loading_{number:02d}" for number in range(len(outcomes))]
-    if figures:
-        for place in places:
-            progress("drawing", None, note=place.name)
+    def show(place: Path) -> None:
+        recording, page = place / "recording.npz", place / "replay.html"
+        if not recording.exists():
+            return
+        progress("drawing", None, note=place.name)
+        if replay and not (page.exists() and page.stat().st_mtime >= recording.stat().st_mtime):
+            write_replay(load_recording(recording), page)
+        if figures:
             write_cycle_figures(place)
+
+    outcomes = run_sequence(scenario, n_loadings, folder, progress=tell, finished=show)
+    places = [folder / f"loading_{number:02d}" for number in range(len(outcomes))]
     summary = calc_sequence_summary(outcomes)
     write_text(folder / "sequence.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
     return summary, [*places, folder / "sequence.json"]
 
 
 def calc_sequence_summary(outcomes: list[CycleOutcome]) -> dict[str, Any]:
-    """Return what a sequence came to: per quantity mean, spread and standard error, and what ended each loading.
+    """Return what a sequence came to: per quantity mean, spread and standard error, what ended each loading, and how
+    often each event happened.
 
     The spread is the standard deviation of single loadings; the standard error of the mean allows for
     successive loadings resembling each other (`drakerock.exploration.noise`). Failed loadings count in neither;
@@ -118,13 +137,14 @@ def calc_sequence_summary(outcomes: list[CycleOutcome]) -> dict[str, Any]:
     """
     objectives = ("production", "damage", "debris")
     values = {name: [outcome.objectives[name] for outcome in outcomes] for name in objectives}
-    for name in ("bucket_mass_kg", "loading_time_s", "energy_J", "wall_time_s"):
+    for name in ("bucket_mass_kg", "weighed_mass_kg", "loading_time_s", "energy_J", "wall_time_s"):
         values[name] = [getattr(outcome, name) for outcome in outcomes]
     return {
         "loadings": len(outcomes),
         "failed": sum(outcome.status == "failed" for outcome in outcomes),
         "strategy": outcomes[0].strategy if outcomes else None,
         "reasons": [outcome.reason for outcome in outcomes],
+        "events": dict(Counter(item["event"] for outcome in outcomes for item in outcome.events or ())),
         "quantities": {name: _summarise(column) for name, column in values.items()},
         "scenario_hash": outcomes[0].scenario_hash if outcomes else None,
     }

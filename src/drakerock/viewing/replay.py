@@ -11,19 +11,25 @@ from pydrake.geometry import Meshcat, MeshcatAnimation, MeshcatParams, Rgba
 from pydrake.math import RigidTransform
 
 from drakerock.loading.recording import Recording
+from drakerock.viewing.keyframes import calc_distances, thin_keyframes
 from drakerock.viewing.scene import calc_rock_colors, draw_site, draw_still_rocks, write_scene
 
 Array = NDArray[np.float64]
 
 _MOVED_TINT = np.array([0.10, 0.04, -0.06])
+# Below one pixel of a screen's width of drift; the recording's own threshold by default [m].
+_ROCK_TOLERANCE = 0.01
+_MACHINE_TOLERANCE = 0.002
+# Rocks that never get farther than this from where they were are drawn as still [m].
+_STILL_TOLERANCE = 0.02
 
 
 def write_replay(recording: Recording, path: str | Path) -> None:
     """Write the replay as one HTML file that opens without a network.
 
-    Rocks that never move are merged into one mesh per size; the others are animated. The camera shows the
-    draw point from the side, the near wall and the roof are left out, and the animation plays with a time
-    slider (Open Controls, Animations).
+    Rocks that don't move are merged into one mesh per size; the others are animated by as few keyframes as show
+    their motion. The camera shows the draw point from the side, the near wall and the roof are left out, and the
+    animation plays with a time slider (Open Controls, Animations).
 
     Raises:
         InputError: the file cannot be written.
@@ -33,23 +39,20 @@ def write_replay(recording: Recording, path: str | Path) -> None:
     for k, visual in enumerate(recording.visuals):
         body = f"machine/{visual.body}_{recording.bodies[visual.body]}"
         meshcat.SetTriangleMesh(f"{body}/{k}", visual.vertices.T, visual.triangles.T, Rgba(*visual.rgba))
-    moving = np.unique(recording.move_rock)
-    _draw_rocks(meshcat, recording, moving)
+    tracks = _make_rock_tracks(recording)
+    _draw_rocks(meshcat, recording, np.array(sorted(tracks), np.int64))
 
     rate = 1.0 / float(np.median(np.diff(recording.times))) if len(recording.times) > 1 else 25.0
     animation = MeshcatAnimation(frames_per_second=rate)
     for b, name in enumerate(recording.bodies):
-        if not any(visual.body == b for visual in recording.visuals):
-            continue
-        last = None
-        for frame in range(len(recording.times)):
-            pose = recording.X_WBs[frame, b].astype(float)
-            # A body that stands still needs its first and last keyframe only.
-            if last is None or frame == len(recording.times) - 1 or np.abs(pose - last).max() > 1e-4:
-                animation.SetTransform(frame, f"machine/{b}_{name}", _to_transform(pose))
-                last = pose
-    for rock in moving:
-        _animate_rock(animation, recording, int(rock))
+        looks = [visual.vertices for visual in recording.visuals if visual.body == b]
+        if looks:
+            frames, poses = np.arange(len(recording.times)), recording.X_WBs[:, b].astype(float)
+            reach = float(np.linalg.norm(np.concatenate(looks), axis=1).max())
+            chosen = thin_keyframes(frames, poses, reach, _MACHINE_TOLERANCE)
+            _animate(animation, f"machine/{b}_{name}", frames[chosen], poses[chosen])
+    for rock, (frames, poses) in tracks.items():
+        _animate(animation, f"rocks/moving/{rock}", frames, poses)
     animation.set_autoplay(True)
     animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     meshcat.SetAnimation(animation)
@@ -57,21 +60,35 @@ def write_replay(recording: Recording, path: str | Path) -> None:
     write_scene(meshcat, path)
 
 
-def _animate_rock(animation: MeshcatAnimation, recording: Recording, rock: int) -> None:
-    rows = np.flatnonzero(recording.move_rock == rock)
-    frames, poses = recording.move_frame[rows], recording.move_pose[rows].astype(float)
-    path = f"rocks/moving/{rock}"
-    animation.SetTransform(0, path, _to_transform(recording.X_WRs[rock]))
-    previous_frame, previous = 0, recording.X_WRs[rock]
-    for frame, pose in zip(frames, poses, strict=True):
-        # The viewer interpolates between keyframes: a rock that rested needs one before it moves on.
-        if frame > previous_frame + 1:
-            animation.SetTransform(int(frame) - 1, path, _to_transform(previous))
-        animation.SetTransform(int(frame), path, _to_transform(pose))
-        previous_frame, previous = frame, pose
+def _make_rock_tracks(recording: Recording) -> dict[int, tuple[NDArray[np.int64], Array]]:
+    """Return the keyframes (k,) and poses (k, 7) of each rock that moves."""
+    radii = np.array([np.linalg.norm(vertices, axis=1).max() for vertices, _ in recording.rock_shapes])
+    order = np.argsort(recording.move_rock, kind="stable")
+    rocks, starts = np.unique(recording.move_rock[order], return_index=True)
+    tracks = {}
+    for rock, rows in zip(rocks.tolist(), np.split(order, starts)[1:], strict=True):
+        moved, moved_poses = (
+            recording.move_frame[rows].astype(np.int64),
+            recording.move_pose[rows].astype(float),
+        )
+        # A rock is recorded in the frames in which it moved: in others it stays where it was.
+        held = np.flatnonzero(np.diff(moved, prepend=0) > 1)
+        before = np.vstack([recording.X_WRs[rock], moved_poses[:-1]])
+        frames = np.concatenate([[0], np.insert(moved, held, moved[held] - 1)])
+        poses = np.vstack([recording.X_WRs[rock], np.insert(moved_poses, held, before[held], axis=0)])
+        reach = float(radii[recording.rock_shape[rock]] * recording.rock_size[rock])
+        chosen = thin_keyframes(frames, poses, reach, _ROCK_TOLERANCE)
+        if calc_distances(poses, np.broadcast_to(poses[0], poses.shape), reach).max() > _STILL_TOLERANCE:
+            tracks[rock] = (frames[chosen], poses[chosen])
+    return tracks
 
 
-def _draw_rocks(meshcat: Meshcat, recording: Recording, moving: NDArray[np.int32]) -> None:
+def _animate(animation: MeshcatAnimation, path: str, frames: NDArray[np.int64], poses: Array) -> None:
+    for frame, pose in zip(frames.tolist(), poses, strict=True):
+        animation.SetTransform(frame, path, _to_transform(pose))
+
+
+def _draw_rocks(meshcat: Meshcat, recording: Recording, moving: NDArray[np.int64]) -> None:
     colors = calc_rock_colors(recording.rock_size)
     still = np.ones(len(recording.rock_size), bool)
     still[moving] = False

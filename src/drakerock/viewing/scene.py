@@ -104,12 +104,14 @@ def draw_site(meshcat: Meshcat, site: SiteConfig, x_start: float, height: float 
 
 
 def write_scene(meshcat: Meshcat, path: str | Path) -> None:
-    """Write the scene as one HTML file that opens without a network.
+    """Write the scene as one HTML file that opens without a network, whole or not at all.
 
     Raises:
         InputError: the file cannot be written.
     """
+    partial = Path(f"{path}.partial")
     try:
-        Path(path).write_text(meshcat.StaticHtml(), encoding="utf-8")
+        partial.write_text(meshcat.StaticHtml(), encoding="utf-8")
+        partial.replace(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None

@@ -10,7 +10,7 @@ from drakerock.dynamics.settling import check_pile, fetch_pile, settle
 from drakerock.loading.scenario import Scenario, load_scenario, make_recipe
 from drakerock.pile.shapes import load_rock_shapes
 from drakerock.pile.site import make_site
-from drakerock.pile.summary import calc_gradation, calc_packing, calc_slope, calc_support
+from drakerock.pile.summary import calc_gradation, calc_imbalance, calc_packing, calc_slope, calc_support
 from drakerock.resources import find_data
 
 RECIPE = make_recipe(Scenario())
@@ -53,14 +53,7 @@ def test_forces_carry_the_weight_within_one_percent(pile, shapes):
 
 def test_forces_carry_each_rocks_weight(pile, shapes):
     """Each rock's own contacts, sideways as well as upwards."""
-    masses = pile.calc_masses(np.array([shape.volume for shape in shapes]), RECIPE.rocks.density)
-    first, second = pile.contacts.pairs.T
-    forces = pile.contacts.impulses.astype(float) / RECIPE.dynamics.time_step
-    sums = np.zeros((len(pile), 3))
-    np.subtract.at(sums, first, forces)
-    np.add.at(sums, second[second >= 0], forces[second >= 0])
-    sums[:, 2] -= masses * 9.81
-    share = np.linalg.norm(sums, axis=1)[~pile.fixed] / (masses * 9.81)[~pile.fixed]
+    share = calc_imbalance(pile, shapes, RECIPE.rocks, RECIPE.dynamics.time_step)
     assert np.percentile(share, 90) < 0.1
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from drakerock.config import calc_config_hash
 from drakerock.dynamics.contact_graph import find_loose
-from drakerock.dynamics.settling import calc_creep, check_pile, fetch_pile, make_pile, refill, settle
+from drakerock.dynamics.settling import WAITING, calc_creep, check_pile, fetch_pile, make_pile, refill, settle
 from drakerock.errors import InputError
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.pile.emission import calc_level, make_emitter, sample_rocks
@@ -130,6 +130,27 @@ def test_refill_of_a_counted_pile_keeps_its_rocks():
     assert np.array_equal(np.sort(after.size), np.sort(pile.size))
     assert np.array_equal(np.bincount(after.shape), np.bincount(pile.shape))
     assert np.all(after.V_WRs == 0)
+
+
+def test_rocks_without_room_wait_for_the_next_refill_and_hold_up_no_other():
+    """Large rocks that the emitter is too narrow for: the small ones behind them are emitted all the same."""
+    site = {"void_depth": 0.6, "rear_layer": 0.0}
+    recipe = make_small_recipe(
+        site=site, rocks={"gradation": [{"size_m": 0.3, "mass_fraction": 1.0}]}, pile={"rocks": 30}
+    )
+    shapes = load_rock_shapes(recipe.rocks.shapes)
+    small = make_pile(recipe)
+    large = sample_rocks(6, recipe.rocks, shapes, np.random.default_rng(0))
+    large = replace(large, size=np.full(6, 0.8), p_WRs=large.p_WRs - [20.0, 0.0, 0.0])
+    pile = large.join(small)
+    removed = np.arange(len(pile)) < 12
+    after = refill(replace(pile, contacts=None), removed, shapes, recipe, np.random.default_rng(1))
+    assert np.array_equal(np.sort(after.size), np.sort(small.size))
+    assert after.provenance[WAITING]["size"] == [0.8] * 6
+    wider = make_small_recipe(site=site, pile={"rocks": 30, "emission_reach": 2.0, "emission_height": 1.5})
+    again = refill(after, np.zeros(len(after), bool), shapes, wider, np.random.default_rng(2))
+    assert np.array_equal(np.sort(again.size), np.sort(pile.size))
+    assert WAITING not in again.provenance
 
 
 def test_tapered_void_by_configuration_alone():

@@ -7,7 +7,15 @@ from hypothesis import strategies as st
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from drakerock.loading.config import PerformanceConfig
-from drakerock.loading.performance import calc_damage, find_bucket_load, find_debris, find_events, find_lost
+from drakerock.loading.performance import (
+    Weighing,
+    calc_damage,
+    find_bucket_load,
+    find_debris,
+    find_events,
+    find_lost,
+    find_weighing_events,
+)
 from drakerock.pile.config import SiteConfig
 
 CONFIG = PerformanceConfig()
@@ -95,3 +103,31 @@ def test_events_have_times_and_do_not_count_turns():
     assert events[0]["time_s"] == pytest.approx(2.01)
     assert events[0]["duration_s"] == pytest.approx(0.99, abs=0.02)
     assert events[1]["waypoint"] == "s2"
+
+
+@pytest.mark.parametrize(
+    ("weight", "on_bucket", "cause"),
+    [
+        (5900, 5890, None),
+        (3000, 3010, "the pile holds up part of the load"),
+        (6400, 6390, "rocks that are not in the bucket bear on it"),
+        (6400, 6005, "rocks bear on other parts of the machine than the bucket"),
+    ],
+)
+def test_weight_that_differs_from_the_counted_load_is_an_event_with_its_cause(weight, on_bucket, cause):
+    weighing = Weighing(time_s=20.0, weight_kg=weight, on_bucket_kg=on_bucket, counted_kg=6000.0)
+    events = find_weighing_events(weighing, load=6000.0, tolerance=150.0)
+    if cause is None:
+        assert events == []
+        return
+    assert [item["event"] for item in events] == ["load and weight differ"]
+    assert events[0]["cause"] == cause
+    assert events[0]["difference_kg"] == 6000.0 - weight
+    assert events[0]["time_s"] == 20.0
+
+
+def test_a_rock_that_falls_off_after_s4_is_an_event():
+    weighing = Weighing(time_s=20.0, weight_kg=5990.0, on_bucket_kg=5990.0, counted_kg=6000.0)
+    (event,) = find_weighing_events(weighing, load=6122.0, tolerance=150.0)
+    assert event["event"] == "load changed after s4"
+    assert event["mass_kg"] == -122.0
