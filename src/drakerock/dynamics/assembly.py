@@ -7,6 +7,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import (
     AddContactMaterial,
     AddRigidHydroelasticProperties,
+    Box,
     Convex,
     HalfSpace,
     ProximityProperties,
@@ -23,6 +24,12 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drakerock.dynamics.config import DynamicsConfig
 from drakerock.pile.site import Site
+
+# A plane that faces up by more than this is a floor.
+FLOOR_COSINE = 0.5
+# Walls: slabs wide enough for any drift, thick enough that nothing passes [m].
+SLAB_WIDTH = 400.0
+SLAB_THICKNESS = 10.0
 
 
 def add_plant(builder: DiagramBuilder, config: DynamicsConfig) -> tuple[MultibodyPlant, SceneGraph]:
@@ -46,7 +53,12 @@ def add_plant(builder: DiagramBuilder, config: DynamicsConfig) -> tuple[Multibod
 
 
 def add_site(plant: MultibodyPlant, site: Site, config: DynamicsConfig) -> None:
-    """Register the site's half-spaces and convex pieces as collision geometry of the world body."""
+    """Register the site's planes and convex pieces as collision geometry of the world body.
+
+    The floor is a half-space, which wheels and rocks meet in closed form; walls are slabs. With several
+    half-spaces, whose boxes have no bounds, Drake's proximity engine reads stray memory now and then when a
+    context is made (1.58: a segmentation fault in its trees).
+    """
     properties = ProximityProperties()
     # Drake's default dissipation, estimated from a penetration allowance, is so large that rocks sink into
     # the floor; the site gets the rocks' own, and is stiff beside them.
@@ -61,7 +73,12 @@ def add_site(plant: MultibodyPlant, site: Site, config: DynamicsConfig) -> None:
     world = plant.world_body()
     for plane in site.planes:
         X_WG = HalfSpace.MakePose(plane.normal, plane.normal * plane.offset)
-        plant.RegisterCollisionGeometry(world, X_WG, HalfSpace(), plane.name, properties)
+        if plane.normal[2] > FLOOR_COSINE:
+            plant.RegisterCollisionGeometry(world, X_WG, HalfSpace(), plane.name, properties)
+        else:
+            slab = Box(SLAB_WIDTH, SLAB_WIDTH, SLAB_THICKNESS)
+            X_GS = RigidTransform([0.0, 0.0, -0.5 * SLAB_THICKNESS])
+            plant.RegisterCollisionGeometry(world, X_WG @ X_GS, slab, plane.name, properties)
     for piece in site.pieces:
         convex = make_convex(piece.vertices, piece.name)
         plant.RegisterCollisionGeometry(world, RigidTransform(), convex, piece.name, properties)

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drakerock.dynamics.assembly import add_plant, add_site
@@ -60,7 +61,6 @@ def test_rock_bodies_have_the_shapes_mass_and_inertia(heap, shapes):
 
 
 def test_fixed_rocks_do_not_move(heap, shapes):
-    from pydrake.systems.analysis import Simulator
 
     fixed = np.zeros(12, bool)
     fixed[:3] = True
@@ -113,3 +113,30 @@ def test_contact_graph_finds_near_pairs_only(heap, shapes):
     apart = replace(pair, p_WRs=np.array([[0, 0, 0], [high + 0.02, 0, 0]]))
     assert len(find_contacts(touching, shapes, 0.005)) == 1
     assert len(find_contacts(apart, shapes, 0.005)) == 0
+
+
+def test_only_the_floor_is_a_half_space(heap, shapes):
+    """Several unbounded geometries beside convex pieces crash Drake's proximity engine now and then."""
+    diagram, _, _ = build(heap, shapes)
+    inspector = diagram.GetSubsystemByName("scene_graph").model_inspector()
+    kinds = [type(inspector.GetShape(geometry)).__name__ for geometry in inspector.GetAllGeometryIds()]
+    assert kinds.count("HalfSpace") == 1
+    assert kinds.count("Box") == 3
+
+
+def test_walls_hold_rocks_in(heap, shapes):
+    """A rock thrown at each wall at 8 m/s comes back or stops, and none is beyond the wall's plane."""
+    site = make_site(SiteConfig(drift_width=3.9))
+    ways = np.array([[0, 8.0, 0], [0, -8.0, 0], [8.0, 0, 0]])
+    p = np.array([[-2.0, 1.0, 1.5], [-2.0, -1.0, 1.5], [site.config.void_depth - 1.5, 0, 1.5]])
+    three = heap.select(np.arange(3))
+    pile = replace(three, p_WRs=p, V_WRs=np.hstack([np.zeros((3, 3)), ways]))
+    diagram, _, rocks = build(pile, shapes)
+    simulator = Simulator(diagram)
+    rocks.set_pile(simulator.get_mutable_context(), pile)
+    simulator.Initialize()
+    simulator.AdvanceTo(0.5)
+    after = rocks.get_pile(simulator.get_context())
+    for plane in site.planes:
+        assert (after.p_WRs @ plane.normal > plane.offset).all()
+    assert (np.linalg.norm(after.V_WRs[:, 3:], axis=1) < 5.0).all()
