@@ -54,12 +54,9 @@ class NonsmoothConfig(Config):
             description="on Hertz's stiffness of two balls of the rocks' sieve widths, modulus and Poisson ratio",
         ),
     ] = 1.0
-    rolling_friction: Annotated[
-        float,
-        Field(
-            ge=0, le=0.2, description="a contact resists spin by this times its force and the pair's radius"
-        ),
-    ] = 0.01
+    spin_damping: Annotated[
+        float, Field(ge=0, le=20, description="each loaded contact damps the pair's relative spin [1/s]")
+    ] = 2.0
     max_recovery_speed: Annotated[
         float, Field(gt=0, description="overlaps are pushed apart at most this fast [m/s]")
     ] = 1.0

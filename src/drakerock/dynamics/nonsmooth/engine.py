@@ -458,10 +458,8 @@ class NonsmoothEngine:
                 rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, dt,
                 config.impact_threshold, config.impact_iterations, self._marks, self._impacts,
             )  # fmt: skip
-        if config.rolling_friction > 0.0:
-            solver.resist_rolling(
-                rows, n_rows, body_a, body_b, self._bodies, n, self.curvature, config.rolling_friction
-            )
+        if config.spin_damping > 0.0:
+            solver.damp_spin(rows, n_rows, body_a, body_b, self._bodies, n, config.spin_damping * dt)
         motion.add_gravity(awake, self._bodies, np.array([0.0, 0.0, -self.gravity * dt]))
         velocity += machine.free_change
         residual = solver.solve_resting(

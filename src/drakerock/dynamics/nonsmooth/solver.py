@@ -284,24 +284,17 @@ def prepare_rows(
 
 
 @kernel
-def resist_rolling(
-    rows: Array,
-    n_rows: int,
-    body_a: Array,
-    body_b: Array,
-    bodies: Array,
-    n_rocks: int,
-    curvature: Array,
-    coefficient: float,
+def damp_spin(
+    rows: Array, n_rows: int, body_a: Array, body_b: Array, bodies: Array, n_rocks: int, share: float
 ) -> None:
-    """Take from the spin of rocks what their contacts' rolling friction resists, by the warm start's loads.
+    """Take a small share from the relative spin of rocks at each of their contacts that carried load.
 
-    A contact resists the two bodies' relative spin with at most `coefficient` times its normal impulse times the
-    pair's radius; it stops the spin, and does not turn it round. Contacts of the machine are left out.
+    It lets rocks that swing on two points come to rest. It is measured by the rocks' own inertia, so that it is
+    nothing beside the moments of contacts under load. Contacts of the machine are left out.
 
     Args:
-        rows, n_rows, body_a, body_b, bodies, n_rocks, curvature: see `prepare_rows`; angular velocities are changed.
-        coefficient: of rolling friction.
+        rows, n_rows, body_a, body_b, bodies, n_rocks: see `prepare_rows`; angular velocities are changed.
+        share: of the relative spin.
     """
     for k in range(n_rows):
         row = rows[k]
@@ -309,20 +302,19 @@ def resist_rolling(
         if row[IMPULSE] <= 0.0 or b > n_rocks:
             continue
         x, y, z = bodies[b, 0] - bodies[a, 0], bodies[b, 1] - bodies[a, 1], bodies[b, 2] - bodies[a, 2]
-        spin = math.sqrt(x * x + y * y + z * z)
-        if spin == 0.0:
-            continue
-        x, y, z = x / spin, y / spin, z / spin
         ax, ay, az = _apply_inertia(bodies[a], x, y, z)
         bx, by, bz = _apply_inertia(bodies[b], x, y, z)
         mobility = x * (ax + bx) + y * (ay + by) + z * (az + bz)
-        impulse = min(coefficient * row[IMPULSE] / (curvature[a] + curvature[b]), spin / mobility)
-        bodies[a, 0] += impulse * ax
-        bodies[a, 1] += impulse * ay
-        bodies[a, 2] += impulse * az
-        bodies[b, 0] -= impulse * bx
-        bodies[b, 1] -= impulse * by
-        bodies[b, 2] -= impulse * bz
+        if mobility <= 0.0:
+            continue
+        # The impulse along the spin that would stop it is spin^2 / mobility, times the share.
+        factor = share * (x * x + y * y + z * z) / mobility
+        bodies[a, 0] += factor * ax
+        bodies[a, 1] += factor * ay
+        bodies[a, 2] += factor * az
+        bodies[b, 0] -= factor * bx
+        bodies[b, 1] -= factor * by
+        bodies[b, 2] -= factor * bz
 
 
 @kernel
