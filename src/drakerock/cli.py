@@ -443,7 +443,10 @@ def _print_outcome(outcome: Any) -> None:
     table.add_row("events", events)
     rocks = outcome.rocks
     table.add_row(
-        "rocks", f"{rocks['total']:.0f}, awake {rocks['awake_mean']:.0f} mean, {rocks['awake_max']:.0f} max"
+        "rocks",
+        f"{rocks['total']:.0f}, awake {rocks['awake_mean']:.0f} mean, {rocks['awake_max']:.0f} max; "
+        f"{rocks['lost']} lost; overlap up to {1e3 * rocks['penetration_max_m']:.0f} mm; "
+        f"{rocks['flagged_steps']} steps flagged",
     )
     table.add_row(
         "cost",

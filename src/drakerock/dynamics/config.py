@@ -76,7 +76,10 @@ class NonsmoothConfig(Config):
     rest: RestConfig = RestConfig()
     max_residual: Annotated[
         float,
-        Field(gt=0, description="a step with more is solved again with more iterations, and flagged"),
+        Field(
+            gt=0,
+            description="a step with more is flagged and solved again with more iterations, then fails",
+        ),
     ] = 0.2
     max_penetration: Annotated[float, Field(gt=0, description="overlaps beyond it are flagged [m]")] = 0.04
     memory_per_rock: Annotated[

@@ -19,8 +19,8 @@ ROCK_SUMMARY: dict[str, str] = {
 }
 """Elements of the ``rock_summary`` output, with units: rocks that are simulated, their contacts, the deepest and the
 99th percentile of the penetration, the solver's residual relative to the sum of impulses (0 where the solver
-converges to its own tolerance), rocks that have left the site, steps so far
-whose residual or penetration was beyond its bound (0 where the engine has none)."""
+converges to its own tolerance), rocks that have left the site, steps so far that had to be solved again or whose
+penetration was beyond its bound (0 where the engine has none)."""
 
 
 class RockSystem(Protocol):

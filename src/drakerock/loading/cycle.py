@@ -66,7 +66,8 @@ class CycleOutcome:
         energy_J: the motors' work over [t0, t4].
         events: stalls, slips, time-outs, a load that changed after s4 or differs from its weight, and rocks
             that still moved when debris was counted, with their times.
-        rocks: number in all, awake at most and on average.
+        rocks: number in all, awake at most and on average; the deepest penetration [m]; how many left the site;
+            steps that had to be solved again or were beyond the bound of penetration.
         wall_time_s, sim_time_s, steps, ms_per_step: cost of the cycle.
         files: names of the files with the planned and the actual tip path.
         seed, versions, scenario_hash: what the cycle depended on.
@@ -422,6 +423,9 @@ def _make_outcome(
             "total": len(masses),
             "awake_max": int(signals["n_awake"].max()) if len(time) else 0,
             "awake_mean": float(signals["n_awake"].mean()) if len(time) else 0.0,
+            "penetration_max_m": float(signals["penetration_max"].max()) if len(time) else 0.0,
+            "lost": int(signals["n_lost"][-1]) if len(time) else 0,
+            "flagged_steps": int(signals["n_flagged"][-1]) if len(time) else 0,
         },
         wall_time_s=wall_time,
         sim_time_s=float(time[-1]) if len(time) else 0.0,

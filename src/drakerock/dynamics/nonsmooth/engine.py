@@ -108,7 +108,7 @@ class StepReport:
         max_penetration, p99_penetration: of loaded points [m].
         n_woken, n_rested, n_lost: rocks that changed state (lost: left the site) in this step.
         redone: the step was solved again with more iterations.
-        flagged: residual or penetration are beyond the bounds of the settings all the same.
+        flagged: it had to be redone, or penetration is beyond the bound of the settings.
         overflow: loaded points that memory could not take.
     """
 
@@ -396,7 +396,8 @@ class NonsmoothEngine:
             state at t_n + dt, and the report.
 
         Raises:
-            SimulationFailure: the result is not finite, also when solved again more carefully.
+            SimulationFailure: the result is not finite or has not converged, also when solved again with
+                `RETRY_FACTOR` times the iterations.
         """
         for name in ("positions", "quaternions", "velocities"):
             if not motion.are_finite(getattr(arrays, name)):
@@ -408,6 +409,11 @@ class NonsmoothEngine:
         again, better = self._try_step(arrays, machine, RETRY_FACTOR * iterations, warm=new is not None)
         if again is None or better is None:
             raise SimulationFailure("rocks: the contact solve gave values that are not finite")
+        if better.residual > self.config.max_residual:
+            raise SimulationFailure(
+                f"rocks: the contact solve did not converge: residual {better.residual:.2g} after "
+                f"{RETRY_FACTOR * iterations} iterations (max_residual {self.config.max_residual:g})"
+            )
         return again, _mark_redone(better)
 
     def _try_step(
@@ -518,7 +524,7 @@ class NonsmoothEngine:
             n_rested=n_rested,
             n_lost=n_lost,
             redone=False,
-            flagged=residual > config.max_residual or max_penetration > config.max_penetration,
+            flagged=max_penetration > config.max_penetration,
             overflow=n_memory - new.n_memory,
         )
         return new, report
@@ -630,7 +636,7 @@ class NonsmoothEngine:
 
 
 def _mark_redone(report: StepReport) -> StepReport:
-    return StepReport(**{**report.__dict__, "redone": True})
+    return replace(report, redone=True, flagged=True)
 
 
 def _calc_percentile(values: Array, share: float) -> float:

@@ -265,13 +265,26 @@ def test_values_that_are_not_finite_do_not_leave_a_step():
         group[0, 0] = before
 
 
-def test_a_step_that_does_not_converge_is_redone():
+@pytest.mark.parametrize("fails", [True, False])
+def test_a_step_that_does_not_converge_is_redone_then_fails(fails):
     pile = make_pile([[0, 0, 0.25 + 0.5 * k] for k in range(20)])
-    config = NonsmoothConfig(reduction="none", iterations=1, max_residual=1e-3)
-    engine = make_engine(pile, [make_box(0.8, 0.8, 0.5)], config=config)
-    _, report = engine.advance(engine.make_arrays(pile))
-    assert report.redone
-    assert report.flagged
+    shapes = [make_box(0.8, 0.8, 0.5)]
+    config = NonsmoothConfig(reduction="none", iterations=4, max_residual=1e9)
+    residuals = []
+    for iterations in (4, 16):
+        engine = make_engine(pile, shapes, config=config.model_copy(update={"iterations": iterations}))
+        residuals.append(engine.advance(engine.make_arrays(pile))[1].residual)
+    assert residuals[0] > 2 * residuals[1] > 0
+    bound = 0.9 * residuals[1] if fails else 1.1 * residuals[1]
+    engine = make_engine(pile, shapes, config=config.model_copy(update={"max_residual": bound}))
+    if fails:
+        with pytest.raises(SimulationFailure, match=r"did not converge: residual .* after 16 iterations"):
+            engine.advance(engine.make_arrays(pile))
+    else:
+        _, report = engine.advance(engine.make_arrays(pile))
+        assert report.redone
+        assert report.flagged
+        assert report.residual == residuals[1]
 
 
 def test_deep_overlap_recovers_slowly():
