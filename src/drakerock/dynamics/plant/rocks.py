@@ -20,6 +20,7 @@ from drakerock.dynamics.assembly import make_convex, make_pose
 from drakerock.dynamics.config import DynamicsConfig
 from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.materials import calc_contact_stiffness
+from drakerock.errors import SimulationFailure
 from drakerock.pile.config import RocksConfig
 from drakerock.pile.shapes import RockShape
 from drakerock.pile.state import PileState
@@ -90,6 +91,10 @@ def _make_kind(
     return inertia, make_convex(shape.vertices, shape.name, size), properties
 
 
+# No position or velocity is larger; NaN is not smaller either.
+HUGE = 1e9
+
+
 class PlantRocks(LeafSystem):
     """Shows the rocks of a plant by the interface that both engines share (`RockSystem`).
 
@@ -136,7 +141,11 @@ class PlantRocks(LeafSystem):
         self._plant.SetPositionsAndVelocities(context, state)
 
     def get_pile(self, root_context: Context) -> PileState:
-        """Read the rocks' present state."""
+        """Read the rocks' present state.
+
+        Raises:
+            SimulationFailure: it is not finite, or absurd.
+        """
         state = self._plant.GetPositionsAndVelocities(self._plant.GetMyContextFromRoot(root_context))
         poses, velocities = self._gather(state)
         return PileState(
@@ -150,6 +159,8 @@ class PlantRocks(LeafSystem):
         )
 
     def _gather(self, state: Array) -> tuple[Array, Array]:
+        if not (np.abs(state) < HUGE).all():
+            raise SimulationFailure("rocks: positions or velocities that are not finite")
         poses = np.hstack([self._pile.q_WRs, self._pile.p_WRs])
         velocities = np.zeros((len(self._pile), 6))
         poses[self._free] = state[self._q[:, None] + np.arange(7)]
