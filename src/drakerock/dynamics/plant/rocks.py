@@ -91,7 +91,7 @@ def _make_kind(
     return inertia, make_convex(shape.vertices, shape.name, size), properties
 
 
-# No position or velocity is larger; NaN is not smaller either.
+# No position is larger; NaN is not smaller either [m].
 HUGE = 1e9
 
 
@@ -102,7 +102,7 @@ class PlantRocks(LeafSystem):
         ``state``: the plant's whole state.
         ``contact_results``, ``body_poses``: the plant's contact results and body poses.
 
-    Output ports: those of `RockSystem`.
+    Output ports: those of `RockSystem`; ``rock_poses`` raises SimulationFailure if they are not finite.
     """
 
     def __init__(self, plant: MultibodyPlant, pile: PileState, geometries: list[GeometryId]) -> None:
@@ -141,11 +141,7 @@ class PlantRocks(LeafSystem):
         self._plant.SetPositionsAndVelocities(context, state)
 
     def get_pile(self, root_context: Context) -> PileState:
-        """Read the rocks' present state.
-
-        Raises:
-            SimulationFailure: it is not finite, or absurd.
-        """
+        """Read the rocks' present state."""
         state = self._plant.GetPositionsAndVelocities(self._plant.GetMyContextFromRoot(root_context))
         poses, velocities = self._gather(state)
         return PileState(
@@ -159,8 +155,6 @@ class PlantRocks(LeafSystem):
         )
 
     def _gather(self, state: Array) -> tuple[Array, Array]:
-        if not (np.abs(state) < HUGE).all():
-            raise SimulationFailure("rocks: positions or velocities that are not finite")
         poses = np.hstack([self._pile.q_WRs, self._pile.p_WRs])
         velocities = np.zeros((len(self._pile), 6))
         poses[self._free] = state[self._q[:, None] + np.arange(7)]
@@ -168,7 +162,10 @@ class PlantRocks(LeafSystem):
         return poses, velocities
 
     def _calc_poses(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._gather(self._state.Eval(context))[0].ravel())
+        poses = self._gather(self._state.Eval(context))[0]
+        if not (np.abs(poses) < HUGE).all():
+            raise SimulationFailure("rocks: positions that are not finite")
+        output.SetFromVector(poses.ravel())
 
     def _calc_velocities(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._gather(self._state.Eval(context))[1].ravel())
