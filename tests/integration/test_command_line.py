@@ -72,7 +72,10 @@ def test_load_writes_everything_it_says(place, loaded):
     assert outcome["strategy"]["alpha"] == 0.4
     assert outcome["phi1"] == -outcome["objectives"]["production"]
     assert outcome["phi1"] == pytest.approx(-outcome["bucket_mass_kg"] / outcome["loading_time_s"])
-    assert set(outcome["rocks"]) == {"total", "awake_max", "awake_mean"}
+    rocks = outcome["rocks"]
+    assert 0 < rocks["awake_mean"] <= rocks["awake_max"] <= rocks["total"]
+    assert 0.0 < rocks["penetration_max_m"] < 0.3
+    assert rocks["lost"] == rocks["flagged_steps"] == 0
     assert np.all(np.diff(outcome["waypoint_times_s"]) >= 0)
     assert {"drakerock", "drake"} <= set(outcome["versions"])
 

@@ -148,7 +148,7 @@ def test_bucket_pressed_into_a_jammed_pile(jammed):
         x_tip=float(pile.p_WRs[:, 0].min()) - 0.7, z_tip=0.02,
     )  # fmt: skip
     forces, depth, fastest = [], 0.0, 0.0
-    for k in range(1200):
+    for k in range(2200):
         scene.step()
         forces.append(scene.get_bucket_force())
         depth = max(depth, scene.get_summary()[2])

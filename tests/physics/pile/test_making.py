@@ -134,7 +134,8 @@ def test_refill_of_a_counted_pile_keeps_its_rocks():
 
 def test_rocks_without_room_wait_for_the_next_refill_and_hold_up_no_other():
     """Large rocks that the emitter is too narrow for: the small ones behind them are emitted all the same."""
-    site = {"void_depth": 0.6, "rear_layer": 0.0}
+    # High enough that the wider emitter before the brow is under the roof.
+    site = {"void_depth": 0.6, "rear_layer": 0.0, "drift_height": 6.0}
     recipe = make_small_recipe(
         site=site, rocks={"gradation": [{"size_m": 0.3, "mass_fraction": 1.0}]}, pile={"rocks": 30}
     )
