@@ -16,7 +16,9 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -92,90 +94,81 @@ def make_small_pile(n: int, site: SiteConfig, height: float, seed: int) -> PileS
     return engine.make_pile(arrays)
 
 
-def run(size: str, seeds: range, variants: list[str], out: Path) -> None:
-    out.mkdir(parents=True, exist_ok=True)
+def list_work(
+    size: str, seeds: range, variants: list[str], path: Path
+) -> Iterator[tuple[int, str, NonsmoothConfig, float, PileState]]:
+    """Yield what is not stored yet: seed, variant, its settings and time step, and the pile it starts from."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     n, site, height = SIZES[size]
-    path = out / f"{size}.jsonl"
     done = {(r["seed"], r["variant"]) for r in read(path)}
     made = -1
-    for seed in seeds:
-        todo = [name for name in variants if (seed, name) not in done]
-        if not todo:
+    for seed, name in product(seeds, variants):
+        if (seed, name) in done:
             continue
-        rng = np.random.default_rng(1000 + seed)
-        if size == "full":
-            pile = clear_way(get_pile())
-        else:
-            number = seed // DIGS_PER_PILE
-            if number != made:
-                pile, made = clear_way(make_small_pile(n, site, height, number)), number
-        depth = rng.uniform(0.8, 2.5)
-        free = 0.5 * site.drift_width - 1.7
-        y = rng.uniform(-free, free)
-        for name in todo:
-            settings, time_step = VARIANTS[name]
-            # Reduction starts with all at rest, so that its rules are what differs.
-            contacts = replace(pile.contacts, resting=np.full(len(pile), settings["reduction"] == "rest"))
-            start = replace(pile, contacts=contacts, V_WRs=np.zeros((len(pile), 6)))
-            result = run_dig(start, make_dig(depth), NonsmoothConfig(**settings), 12.0, time_step, site, y)
-            with open(path, "a", encoding="utf-8") as file:
-                file.write(json.dumps({"seed": seed, "variant": name, **result}) + "\n")
-            print(size, seed, name, {k: round(result[k], 3) for k in METRICS}, flush=True)
-
-
-def run_cycles(size: str, seeds: range, variants: list[str], out: Path) -> None:
-    """Whole loading cycles, each of a strategy drawn from the method's ranges."""
-    out.mkdir(parents=True, exist_ok=True)
-    n, site, height = SIZES[size]
-    path = out / f"{size}-cycles.jsonl"
-    done = {(r["seed"], r["variant"]) for r in read(path)}
-    made = -1
-    for seed in seeds:
-        todo = [name for name in variants if (seed, name) not in done]
-        if not todo:
-            continue
-        rng = np.random.default_rng(2000 + seed)
-        strategy = dict(zip(STRATEGY, rng.uniform(*np.transpose(list(STRATEGY.values()))), strict=True))
         number = 0 if size == "full" else seed // DIGS_PER_PILE
         if number != made:
             pile = get_pile() if size == "full" else make_small_pile(n, site, height, number)
             made = number
-        for name in todo:
-            settings, time_step = VARIANTS[name]
-            contacts = replace(pile.contacts, resting=np.full(len(pile), settings["reduction"] == "rest"))
-            start = replace(pile, contacts=contacts, V_WRs=np.zeros((len(pile), 6)))
-            scenario = Scenario(
-                seed=seed,
-                site=site,
-                pile=PileConfig(rocks=n or None, emission_height=height),
-                dynamics=DynamicsConfig(nonsmooth=NonsmoothConfig(**settings), time_step=time_step),
-                loading=LoadingConfig(strategy=strategy),
-            )
-            cpu = time.process_time()
-            result = run_cycle(scenario, start)
-            cpu = time.process_time() - cpu
-            outcome = result.outcome
-            if outcome.loading_time_s is None or outcome.peak_push_force_N is None:
-                print(size, seed, name, outcome.reason)
-                values: dict[str, float] = {}
-            else:
-                after = result.pile_after
-                moved = np.linalg.norm(after.p_WRs - result.pile_before.p_WRs, axis=1) > 0.05
-                masses = start.calc_masses(np.array([shape.volume for shape in SHAPES]), ROCKS.density)
-                values = {
-                    "bucket_mass_kg": outcome.bucket_mass_kg,
-                    "loading_time_s": outcome.loading_time_s,
-                    "peak_push_kN": outcome.peak_push_force_N / 1e3,
-                    "mean_push_kN": outcome.mean_push_force_N / 1e3,
-                    "displaced_m3": float(masses[moved].sum() / ROCKS.density),
-                    "production_kg_s": outcome.objectives["production"],
-                    "damage": outcome.objectives["damage"],
-                    "debris_kg": outcome.objectives["debris"],
-                    "cpu_s": cpu,
-                }
-            with open(path, "a", encoding="utf-8") as file:
-                file.write(json.dumps({"seed": seed, "variant": name, **values}) + "\n")
-            print(size, seed, name, {k: round(v, 3) for k, v in values.items()}, flush=True)
+        settings, time_step = VARIANTS[name]
+        # Reduction starts with all at rest, so that its rules are what differs.
+        contacts = replace(pile.contacts, resting=np.full(len(pile), settings["reduction"] == "rest"))
+        start = replace(pile, contacts=contacts, V_WRs=np.zeros((len(pile), 6)))
+        yield seed, name, NonsmoothConfig(**settings), time_step, start
+
+
+def store(path: Path, seed: int, variant: str, values: dict[str, float], metrics: Sequence[str]) -> None:
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(json.dumps({"seed": seed, "variant": variant, **values}) + "\n")
+    print(path.stem, seed, variant, {k: round(values[k], 3) for k in metrics if k in values}, flush=True)
+
+
+def run(size: str, seeds: range, variants: list[str], out: Path) -> None:
+    """Digs by fixed rates, each at another place and depth."""
+    site, path = SIZES[size][1], out / f"{size}.jsonl"
+    free = 0.5 * site.drift_width - 1.7
+    for seed, name, config, time_step, pile in list_work(size, seeds, variants, path):
+        rng = np.random.default_rng(1000 + seed)
+        depth, y = rng.uniform(0.8, 2.5), rng.uniform(-free, free)
+        result = run_dig(clear_way(pile), make_dig(depth), config, 12.0, time_step, site, y)
+        store(path, seed, name, result, METRICS)
+
+
+def run_cycles(size: str, seeds: range, variants: list[str], out: Path) -> None:
+    """Whole loading cycles, each of a strategy drawn from the method's ranges."""
+    n, site, height = SIZES[size]
+    path = out / f"{size}-cycles.jsonl"
+    for seed, name, config, time_step, pile in list_work(size, seeds, variants, path):
+        rng = np.random.default_rng(2000 + seed)
+        strategy = dict(zip(STRATEGY, rng.uniform(*np.transpose(list(STRATEGY.values()))), strict=True))
+        scenario = Scenario(
+            seed=seed,
+            site=site,
+            pile=PileConfig(rocks=n or None, emission_height=height),
+            dynamics=DynamicsConfig(nonsmooth=config, time_step=time_step),
+            loading=LoadingConfig(strategy=strategy),
+        )
+        cpu = time.process_time()
+        result = run_cycle(scenario, pile)
+        cpu = time.process_time() - cpu
+        outcome = result.outcome
+        values: dict[str, float] = {}
+        if outcome.loading_time_s is None or outcome.peak_push_force_N is None:
+            print(path.stem, seed, name, outcome.reason)
+        else:
+            moved = np.linalg.norm(result.pile_after.p_WRs - result.pile_before.p_WRs, axis=1) > 0.05
+            masses = pile.calc_masses(np.array([shape.volume for shape in SHAPES]), ROCKS.density)
+            values = {
+                "bucket_mass_kg": outcome.bucket_mass_kg,
+                "loading_time_s": outcome.loading_time_s,
+                "peak_push_kN": outcome.peak_push_force_N / 1e3,
+                "mean_push_kN": outcome.mean_push_force_N / 1e3,
+                "displaced_m3": float(masses[moved].sum() / ROCKS.density),
+                "production_kg_s": outcome.objectives["production"],
+                "damage": outcome.objectives["damage"],
+                "debris_kg": outcome.objectives["debris"],
+                "cpu_s": cpu,
+            }
+        store(path, seed, name, values, CYCLE_METRICS)
 
 
 def read(path: Path) -> list[dict]:
