@@ -57,6 +57,8 @@ WAITING = "waiting_rocks"
 CARRIED_TOLERANCE = 0.003
 IMBALANCE_P90 = 0.03
 BALANCE_WINDOW = 0.1
+# All are kept awake at least so long [s].
+BALANCE_LEAST = 0.3
 # Rocks that are set off by all being awake have so long to fall [s]; then all are kept awake again, at most so often,
 # and not when they were so small a share of the rocks that the others' balance stays.
 FALL_TIME = 5.0
@@ -343,10 +345,16 @@ def _balance(
 
     few = FEW_SHARE * len(pile)
     for _ in range(BALANCE_ROUNDS):
-        pile, _ = settle(
-            pile, shapes, awake, recipe.pile.balance_time, site=site,
-            until=is_balanced if until_balanced else None, window=BALANCE_WINDOW if until_balanced else None,
-        )  # fmt: skip
+        if until_balanced:
+            # A rock that only leans shows it only after a while.
+            first = min(BALANCE_LEAST, recipe.pile.balance_time)
+            pile, _ = settle(pile, shapes, awake, first, site=site)
+            pile, _ = settle(
+                pile, shapes, awake, recipe.pile.balance_time - first, site=site, until=is_balanced,
+                window=BALANCE_WINDOW,
+            )  # fmt: skip
+        else:
+            pile, _ = settle(pile, shapes, awake, recipe.pile.balance_time, site=site)
         assert pile.contacts is not None
         fast = find_fast(pile)
         pile = replace(pile, contacts=replace(pile.contacts, resting=~pile.fixed & ~fast))
