@@ -19,6 +19,7 @@ from typing import Any
 from drakerock.errors import InputError, RunStopped
 from drakerock.study.schema import ExecutorConfig, SlurmConfig
 from drakerock.study.work import Task, TaskResult, run_task
+from drakerock.study.worker_setup import silence_closing
 
 # One thread each: the simulation is sequential, and there is a process for every core.
 THREADS = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -269,6 +270,7 @@ def _start_local(workers: int, memory_limit: str) -> DaskExecutor:
     import dask
     from distributed import LocalCluster
 
+    silence_closing()
     # Dask would silently try the task of a dead worker on three more; the runner does that, and counts.
     with dask.config.set(DASK | {"distributed.scheduler.allowed-failures": 0}):
         cluster = LocalCluster(

@@ -12,3 +12,12 @@ def dask_setup(_worker: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # The runner says it, for all of them.
     logging.getLogger("drakerock.dynamics.nonsmooth.compiling").setLevel(logging.ERROR)
+    silence_closing()
+
+
+def silence_closing() -> None:
+    """Keep Dask from logging a traceback when a worker's connection closes before its last message is sent.
+
+    Dask's own silencing ends while the cluster is closing.
+    """
+    logging.getLogger("distributed.batched").setLevel(logging.CRITICAL)
