@@ -34,9 +34,9 @@ def make_bin(opening: float) -> Site:
     return Site(SiteConfig(), planes, pieces)
 
 
-def calc_discharge(shapes, opening: float) -> float:
+def calc_discharge(shapes, opening: float, seed: int) -> float:
     """Return the rocks' rate through the slot, while it is steady [1/s]."""
-    n, rng = 1600, np.random.default_rng(0)
+    n, rng = 1600, np.random.default_rng(seed)
     per_layer = np.array([(x, y) for x in np.arange(-0.81, 0.85, 0.135) for y in (-0.2, 0.0, 0.2)])
     p_WRs = np.array(
         [(*per_layer[k % len(per_layer)], LIFT + 0.1 + 0.14 * (k // len(per_layer))) for k in range(n)]
@@ -75,7 +75,10 @@ def calc_discharge(shapes, opening: float) -> float:
 @pytest.mark.slow
 def test_discharge_goes_with_the_slots_width_to_the_power_three_halves(shapes):
     openings = D * np.array([4.5, 5.5, 6.5, 8.0])
-    rates = np.array([calc_discharge(shapes, opening) for opening in openings])
+    # A single bin's rate scatters by a tenth, and with it the exponent by 0.3.
+    rates = np.array(
+        [np.mean([calc_discharge(shapes, opening, seed) for seed in range(5)]) for opening in openings]
+    )
     print("openings [m]", openings, "rates [1/s]", rates)
     exponent = np.polyfit(np.log(openings - 1.4 * D), np.log(rates), 1)[0]
     print("exponent", exponent)
