@@ -51,7 +51,7 @@ class NonsmoothConfig(Config):
         float,
         Field(
             gt=0,
-            description="on Hertz's stiffness of two balls of the rocks' sieve widths, modulus and Poisson ratio",
+            description="on Hertz's stiffness of balls whose radii are the sieve widths, by modulus and Poisson ratio",
         ),
     ] = 1.0
     spin_damping: Annotated[

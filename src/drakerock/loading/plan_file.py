@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from drakerock.errors import InputError
+from drakerock.files import write_text
 from drakerock.loading.field import HeightField
 from drakerock.loading.plan import DigPlan, NoPlan
 
@@ -26,10 +27,7 @@ def save_plan(plan: DigPlan | NoPlan, field: HeightField, path: str | Path) -> N
         "h": np.round(field.h, 4).tolist(),
         "cell": field.cell,
     }
-    try:
-        Path(path).write_text(json.dumps(data), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    write_text(Path(path), json.dumps(data))
 
 
 def load_plan(path: str | Path) -> tuple[DigPlan | NoPlan, HeightField]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drakerock.pile.config import RocksConfig, SiteConfig
+from drakerock.pile.emission import GRAVITY
 from drakerock.pile.geometry import cast_rays, make_pile_mesh
 from drakerock.pile.shapes import RockShape
 from drakerock.pile.site import Site
@@ -121,7 +122,7 @@ def calc_support(
     masses = pile.calc_masses(np.array([shape.volume for shape in shapes]), rocks.density)
     n_pairs = len(np.unique(pile.contacts.pairs[between], axis=0))
     return Support(
-        weight=float(masses[moving].sum()) * 9.81,
+        weight=float(masses[moving].sum()) * GRAVITY,
         floor=float(lift[carried & on_floor].sum()),
         walls=float(lift[carried & ~on_floor].sum()),
         static=float(np.where(moving[first], lift, -lift)[mixed].sum()),
@@ -145,7 +146,7 @@ def calc_imbalance(
     """
     if pile.contacts is None:
         raise ValueError("the pile has no contacts")
-    weights = 9.81 * pile.calc_masses(np.array([shape.volume for shape in shapes]), rocks.density)
+    weights = GRAVITY * pile.calc_masses(np.array([shape.volume for shape in shapes]), rocks.density)
     first, second = pile.contacts.pairs.T
     forces = pile.contacts.impulses.astype(float) / time_step
     sums = np.zeros((len(pile), 3))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, Rgba
 from scipy.spatial.transform import Rotation
 
-from drakerock.errors import InputError
+from drakerock.files import write_text
 from drakerock.pile.config import SiteConfig
 
 Array = NDArray[np.float64]
@@ -109,9 +109,4 @@ def write_scene(meshcat: Meshcat, path: str | Path) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    partial = Path(f"{path}.partial")
-    try:
-        partial.write_text(meshcat.StaticHtml(), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    write_text(Path(path), meshcat.StaticHtml())
