@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import InitializeParams, Simulator
 
-from drakerock.loading.control import Mode
+from drakerock.loading.control import FeedforwardController, Mode
 from drakerock.loading.cycle import run_cycle
 from drakerock.loading.plan_file import save_plan
 from drakerock.loading.recording import load_recording, save_recording
@@ -22,6 +22,11 @@ def pile(small_scenario):
 @pytest.fixture(scope="module")
 def result(small_scenario, pile):
     return run_cycle(small_scenario, pile)
+
+
+def use_engine(scenario, engine):
+    """Return the scenario with that rock engine."""
+    return scenario.model_copy(update={"dynamics": scenario.dynamics.model_copy(update={"rocks": engine})})
 
 
 def test_modes_run_in_order_and_the_load_is_weighed(result):
@@ -58,8 +63,7 @@ def test_load_is_counted_when_s4_is_passed(small_scenario, pile, result):
 
 @pytest.mark.parametrize("engine", ["plant", "nonsmooth"])
 def test_rows_hold_the_step_that_begins(small_scenario, pile, engine):
-    dynamics = small_scenario.dynamics.model_copy(update={"rocks": engine})
-    station = make_station(small_scenario.model_copy(update={"dynamics": dynamics}), pile)
+    station = make_station(use_engine(small_scenario, engine), pile)
     simulator = Simulator(station.diagram)
     root = simulator.get_mutable_context()
     station.rocks.set_pile(root, pile)
@@ -104,8 +108,7 @@ def with_loading(scenario, **parts):
     loading = scenario.loading.model_copy(
         update={name: getattr(scenario.loading, name).model_copy(update=keys) for name, keys in parts.items()}
     )
-    dynamics = scenario.dynamics.model_copy(update={"rocks": "nonsmooth"})
-    return scenario.model_copy(update={"loading": loading, "dynamics": dynamics})
+    return use_engine(scenario.model_copy(update={"loading": loading}), "nonsmooth")
 
 
 def test_reaching_s4_is_a_reason(result):
@@ -197,10 +200,31 @@ def test_solver_failure_is_a_recorded_outcome(small_scenario, pile):
     assert result.recording is not None
 
 
-def test_rocks_that_explode_are_a_failure_not_a_crash(small_scenario, pile):
-    wild = replace(pile, V_WRs=pile.V_WRs + np.array([0, 0, 0, 0, 0, 1e160]))
-    outcome = run_cycle(small_scenario, wild).outcome
+@pytest.mark.parametrize("engine", ["plant", "nonsmooth"])
+@pytest.mark.parametrize("speed", [1e20, 1e160])
+def test_rocks_that_explode_are_a_failure_not_a_crash(small_scenario, pile, engine, speed):
+    """Nothing computes with such a state: Drake's proximity engine has crashed on it."""
+    wild = replace(pile, V_WRs=pile.V_WRs + np.array([0, 0, 0, 0, 0, speed]), contacts=None)
+    scenario = use_engine(small_scenario, engine)
+    outcome = run_cycle(scenario, wild).outcome
     assert outcome.status == "failed"
+    assert outcome.steps <= 1
+    assert "not finite" in outcome.reason
+
+
+@pytest.mark.parametrize("engine", ["plant", "nonsmooth"])
+def test_motor_speeds_that_are_no_numbers_are_a_failure(small_scenario, pile, monkeypatch, engine):
+    def break_in_time(self: FeedforwardController, context, output):
+        calc(self, context, output)
+        if context.get_time() > 0.3:
+            output.SetFromVector(np.full(output.size(), np.nan))
+
+    calc = FeedforwardController._calc_motor_speeds
+    monkeypatch.setattr(FeedforwardController, "_calc_motor_speeds", break_in_time)
+    scenario = use_engine(small_scenario, engine)
+    outcome = run_cycle(scenario, replace(pile, contacts=None)).outcome
+    assert outcome.status == "failed"
+    assert outcome.sim_time_s == pytest.approx(0.3, abs=0.05)
 
 
 def test_context_can_be_saved_and_repeated(small_scenario, pile):

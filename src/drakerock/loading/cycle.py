@@ -172,7 +172,6 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
     plan: DigPlan | NoPlan = station.diagram.GetOutputPort("plan").Eval(root)
     if isinstance(plan, DigPlan):
         _place(station, root, x_tip=float(plan.waypoint_x[0]) - scenario.loading.planning.run_up, y=plan.y)
-    simulator.Initialize(InitializeParams(suppress_initialization_events=True))
 
     body_poses = station.plant.get_body_poses_output_port()
     mode_port = station.diagram.GetOutputPort("mode")
@@ -225,9 +224,10 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
     record()
     load, at_rest = np.zeros(len(pile), bool), True
     last_pile = pile
-    simulator.set_monitor(stop_at_s4)
     frame, last_check = 0, 0.0
     try:
+        simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+        simulator.set_monitor(stop_at_s4)
         while not isinstance(plan, NoPlan):
             frame += 1
             simulator.AdvanceTo(frame / scenario.recording.frame_rate)
@@ -254,7 +254,10 @@ def run_cycle(scenario: Scenario, pile: PileState, progress: Progress | None = N
     except (RuntimeError, SimulationFailure) as error:
         failure = f"solver failure at {root.get_time():.2f} s: {error}"
 
-    pile_after = station.rocks.get_pile(root)
+    try:
+        pile_after = station.rocks.get_pile(root)
+    except ValueError:  # a failure left rocks that are nowhere
+        pile_after = last_pile
     signals, units = calc_signals(station, root)
     controller = np.array(progress_port.Eval(root))
     in_bucket, debris = load, np.zeros(len(pile), bool)

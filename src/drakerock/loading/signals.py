@@ -26,7 +26,10 @@ def calc_signals(station: Station, root_context: Context) -> tuple[dict[str, Arr
     difference of the wheels' circumferential speed and the front unit's.
     """
     data = {name: log.FindLog(root_context).data() for name, log in station.logs.items()}
-    time = station.logs["mode"].FindLog(root_context).sample_times()
+    # A failure leaves the logs of its step incomplete.
+    count = min(rows.shape[1] for rows in data.values())
+    data = {name: rows[:, :count] for name, rows in data.items()}
+    time = station.logs["mode"].FindLog(root_context).sample_times()[:count]
     columns: dict[str, Array] = {"time": time, "mode": data["mode"][0]}
     units: dict[str, str] = {"time": "s", "mode": "1"}
 
@@ -66,7 +69,7 @@ def calc_signals(station: Station, root_context: Context) -> tuple[dict[str, Arr
         power = (torque * 0.5 * (rate + following)).sum(axis=0)
         columns[f"power_{name}"], units[f"power_{name}"] = power, "W"
         total += power
-    columns["work"], units["work"] = np.concatenate([[0.0], np.cumsum(total[:-1]) * step]), "J"
+    columns["work"], units["work"] = np.concatenate([[0.0], np.cumsum(total[:-1]) * step])[:count], "J"
     wheel_speed = columns["wheel_rate"] * station.digger.kinematics.wheel_radius
     columns["wheel_slip"], units["wheel_slip"] = wheel_speed - columns["v_F"], "m/s"
     return columns, units

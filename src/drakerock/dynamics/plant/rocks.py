@@ -20,6 +20,7 @@ from drakerock.dynamics.assembly import make_convex, make_pose
 from drakerock.dynamics.config import DynamicsConfig
 from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.materials import calc_contact_stiffness
+from drakerock.dynamics.nonsmooth.motion import HUGE
 from drakerock.errors import SimulationFailure
 from drakerock.pile.config import RocksConfig
 from drakerock.pile.shapes import RockShape
@@ -91,10 +92,6 @@ def _make_kind(
     return inertia, make_convex(shape.vertices, shape.name, size), properties
 
 
-# No position is larger; NaN is not smaller either [m].
-HUGE = 1e9
-
-
 class PlantRocks(LeafSystem):
     """Shows the rocks of a plant by the interface that both engines share (`RockSystem`).
 
@@ -102,7 +99,10 @@ class PlantRocks(LeafSystem):
         ``state``: the plant's whole state.
         ``contact_results``, ``body_poses``: the plant's contact results and body poses.
 
-    Output ports: those of `RockSystem`; ``rock_poses`` raises SimulationFailure if they are not finite.
+    Output ports: those of `RockSystem`.
+
+    After every step, before anything else looks at it, the plant's state is checked: Drake's proximity engine does
+    not survive poses that are not finite. SimulationFailure is raised then.
     """
 
     def __init__(self, plant: MultibodyPlant, pile: PileState, geometries: list[GeometryId]) -> None:
@@ -131,6 +131,12 @@ class PlantRocks(LeafSystem):
         self.DeclareVectorOutputPort("rock_velocities", 6 * n, self._calc_velocities, state_only)
         self.DeclareVectorOutputPort("rock_summary", len(ROCK_SUMMARY), self._calc_summary)
         self.DeclareVectorOutputPort("F_B_W", 6, self._calc_bucket_force)
+        # Publish events come in the order of the systems: this one before those of the logs.
+        self.DeclarePerStepPublishEvent(self._check)
+
+    def _check(self, context: Context) -> None:
+        if not (np.abs(self._state.Eval(context)) < HUGE).all():
+            raise SimulationFailure("rocks: positions or velocities that are not finite")
 
     def set_pile(self, root_context: Context, pile: PileState) -> None:
         """Write poses and velocities of the free rocks into the plant's context."""
@@ -162,10 +168,7 @@ class PlantRocks(LeafSystem):
         return poses, velocities
 
     def _calc_poses(self, context: Context, output: BasicVector) -> None:
-        poses = self._gather(self._state.Eval(context))[0]
-        if not (np.abs(poses) < HUGE).all():
-            raise SimulationFailure("rocks: positions that are not finite")
-        output.SetFromVector(poses.ravel())
+        output.SetFromVector(self._gather(self._state.Eval(context))[0].ravel())
 
     def _calc_velocities(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._gather(self._state.Eval(context))[1].ravel())
