@@ -72,6 +72,10 @@ class NonsmoothConfig(Config):
     face_cosine: Annotated[
         float, Field(gt=0, le=1, description="faces touch if this well aligned with the contact's normal")
     ] = 0.985
+    manifold_points: Annotated[
+        int,
+        Field(ge=1, le=4, description="points per pair; with 1, as in point contact, faces roll on faces"),
+    ] = 4
     reduction: Literal["none", "rest"] = "rest"
     rest: RestConfig = RestConfig()
     max_residual: Annotated[
@@ -81,10 +85,16 @@ class NonsmoothConfig(Config):
             description="a step with more is flagged and solved again with more iterations, then fails",
         ),
     ] = 0.2
-    max_penetration: Annotated[float, Field(gt=0, description="overlaps beyond it are flagged [m]")] = 0.04
+    max_penetration: Annotated[
+        float,
+        Field(
+            gt=0,
+            description="overlaps beyond it are flagged, beyond 3/8 of it solved with more iterations [m]",
+        ),
+    ] = 0.04
     memory_per_rock: Annotated[
         int, Field(ge=3, le=50, description="loaded contact points that can be kept, per rock")
-    ] = 5
+    ] = 4
 
     @model_validator(mode="after")
     def _check_margins(self) -> NonsmoothConfig:

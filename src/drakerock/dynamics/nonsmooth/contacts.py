@@ -1,8 +1,8 @@
 """Contact rows and the memory of contacts: what a contact point is, and how it is found again.
 
 Memory holds the loaded points of the last step: the pair's key, the point in the frame of the pair's first
-rock and the impulse in W. It is what makes a stored pile start warm and what a resting pile's force network
-is kept in.
+rock, the impulse in W, and where the search for the pair's nearest points ended. It is what makes a stored pile
+start warm and what a resting pile's force network is kept in.
 """
 
 from __future__ import annotations
@@ -26,13 +26,15 @@ IMPULSE = 24  # 24..26 normal, tangent 1, tangent 2 [N s]
 GAP = 27
 RESTITUTION = 28
 TANGENT_STEP = 29  # 2 / trace of the tangential block
+SIMPLEX = 30  # where the search for the nearest points ended, see `gjk.encode_simplex`; or 0
 ROW_WIDTH = 32
 
 # Columns of the memory.
 MEMORY_KEY = 0
 MEMORY_POINT = 1  # 1..3
 MEMORY_IMPULSE = 4  # 4..6
-MEMORY_WIDTH = 7
+MEMORY_SIMPLEX = 7
+MEMORY_WIDTH = 8
 
 # A pair's key is first * KEY_STEP + second: exact in a double.
 KEY_STEP = 1 << 20
@@ -44,18 +46,15 @@ def _hash(key: int, mask: int) -> int:
 
 
 @kernel
-def index_memory(
-    memory: Array, n_memory: int, n_rocks: int, status: Array, active: Array, table: Array
-) -> tuple[int, int]:
+def index_memory(memory: Array, n_rocks: int, status: Array, active: Array, table: Array) -> tuple[int, int]:
     """Set a hash table from a pair's key to the first of its rows in memory (rows of a pair are in line).
 
     Args:
-        memory: (.., MEMORY_WIDTH).
-        n_memory: number of rows.
+        memory: (m, MEMORY_WIDTH).
         n_rocks: number of rocks.
         status: (n,) of each rock, see `broad_phase`. A pair without an awake rock is idle: it is not searched, its
             points stay as they are, and it is left out.
-        active: (.., ) scratch, as many as rows.
+        active: (m,) at least, set: the rows that are not idle.
         table: (2**k,) at least twice as many places as rows; as many of the first as needed are set, -1 where
             empty.
 
@@ -63,7 +62,7 @@ def index_memory(
         how many places are in use: a power of two; look up in ``table[:places]``. And the number of active rows.
     """
     n_active = 0
-    for row in range(n_memory):
+    for row in range(len(memory)):
         key = int(memory[row, MEMORY_KEY])
         a, b = key // KEY_STEP, key % KEY_STEP
         if status[a] == 0 or (b < n_rocks and status[b] == 0):
@@ -111,7 +110,6 @@ def write_memory(
     n_rocks: int,
     status: Array,
     old: Array,
-    n_old: int,
     active: Array,
     n_active: int,
     rows: Array,
@@ -126,19 +124,19 @@ def write_memory(
     Args:
         n_rocks: number of rocks.
         status: (n,) of each rock, see `broad_phase`; 0 is awake.
-        old, n_old: memory of the last step and its length.
+        old: memory of the last step.
         active, n_active: its rows that were looked up, see `index_memory`; the others are kept.
         rows, n_rows: contact rows after the solve.
         row_key, row_rock: per row the pair's key and its first rock.
         rotations: (n, 3, 3) of the rocks at the poses of the solve.
-        new: (capacity, MEMORY_WIDTH) set, zero beyond the last point.
+        new: (capacity, MEMORY_WIDTH) set, as many rows as there are points.
 
     Returns:
         the number of points; beyond the capacity they are counted but lost.
     """
     n_new = 0
     next_active = 0
-    for row in range(n_old):
+    for row in range(len(old)):
         if next_active < n_active and active[next_active] == row:
             next_active += 1
             continue
@@ -158,6 +156,7 @@ def write_memory(
         if n_new < len(new):
             a = row_rock[k]
             new[n_new, MEMORY_KEY] = row_key[k]
+            new[n_new, MEMORY_SIMPLEX] = row[SIMPLEX]
             for d in range(3):
                 new[n_new, MEMORY_POINT + d] = (
                     rotations[a, 0, d] * row[ARM_A]
@@ -168,17 +167,14 @@ def write_memory(
                     normal * row[NORMAL + d] + tangent_1 * row[TANGENT_1 + d] + tangent_2 * row[TANGENT_2 + d]
                 )
         n_new += 1
-    for k in range(n_new, len(new)):
-        for d in range(MEMORY_WIDTH):
-            new[k, d] = 0.0
     return n_new
 
 
 @kernel
-def sum_impulses(memory: Array, n_memory: int, n_rocks: int, sums: Array) -> None:
+def sum_impulses(memory: Array, n_rocks: int, sums: Array) -> None:
     """Set `sums` (n, 3) to the sum of the contact impulses on each rock [N s]."""
     sums[:] = 0.0
-    for row in range(n_memory):
+    for row in range(len(memory)):
         key = int(memory[row, MEMORY_KEY])
         a, b = key // KEY_STEP, key % KEY_STEP
         for d in range(3):

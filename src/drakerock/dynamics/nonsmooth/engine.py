@@ -35,8 +35,11 @@ _log = logging.getLogger(__name__)
 GRAVITY = 9.81
 # How far outside the site's box a rock still counts as inside [m].
 SITE_MARGIN = 0.5
-# A step that failed is solved again with this many times the iterations, from a cold start.
+# A step that failed is solved again with this many times the iterations, from a cold start; a step that begins with
+# an overlap beyond this share of the bound is solved with as many at once. A light rock that the machine presses into
+# a jammed pile passes on little of the machine's momentum per iteration, and is squeezed meanwhile.
 RETRY_FACTOR = 4
+DEEP_SHARE = 0.375
 
 
 @dataclass(frozen=True)
@@ -82,8 +85,7 @@ class RockArrays:
         positions: (n, 3) [m].
         velocities: (n, 6) angular, translational in W.
         book: (n, reduction.BOOK_WIDTH) status and bookkeeping of the reduction.
-        memory: (capacity, contacts.MEMORY_WIDTH) loaded contact points.
-        n_memory: how many of them count.
+        memory: (m, contacts.MEMORY_WIDTH) loaded contact points; m changes from step to step.
     """
 
     quaternions: Array
@@ -91,7 +93,6 @@ class RockArrays:
     velocities: Array
     book: Array
     memory: Array
-    n_memory: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,15 +298,14 @@ class NonsmoothEngine:
         book = np.zeros((n, reduction.BOOK_WIDTH))
         book[:, reduction.STATUS] = np.where(self.fixed, FIXED, AWAKE)
         book[:, reduction.ANCHOR : reduction.ANCHOR + 3] = pile.p_WRs
-        memory = np.zeros((self.capacity, contacts.MEMORY_WIDTH))
-        n_memory = 0
+        memory = np.zeros((0, contacts.MEMORY_WIDTH))
         if pile.contacts is not None:
-            n_memory = self._fill_memory(pile.contacts, memory)
+            memory = self._make_memory(pile.contacts)
             if self.config.reduction == "rest":
                 resting = pile.contacts.resting & ~self.fixed
                 book[resting, reduction.STATUS] = RESTING
                 sums = np.zeros((n, 3))
-                contacts.sum_impulses(memory, n_memory, n, sums)
+                contacts.sum_impulses(memory, n, sums)
                 book[resting, reduction.REFERENCE : reduction.REFERENCE + 3] = sums[resting]
         velocities = pile.V_WRs.copy()
         velocities[book[:, reduction.STATUS] != AWAKE] = 0.0
@@ -317,14 +317,13 @@ class NonsmoothEngine:
             velocities,
             book,
             memory,
-            n_memory,
         )
         book[self._find_lost(arrays.positions) & ~self.fixed, reduction.STATUS] = LOST
         return arrays
 
     def make_pile(self, arrays: RockArrays, provenance: dict[str, object] | None = None) -> PileState:
         """Return the pile of state arrays, contact memory included."""
-        rows = arrays.memory[: arrays.n_memory]
+        rows = arrays.memory
         keys = rows[:, contacts.MEMORY_KEY].astype(np.int64)
         pairs = np.column_stack([keys // contacts.KEY_STEP, keys % contacts.KEY_STEP])
         kept = pairs[:, 1] < self.first_piece  # the machine's are not the pile's
@@ -349,17 +348,14 @@ class NonsmoothEngine:
             memory,
         )
 
-    def _fill_memory(self, stored: ContactMemory, memory: Array) -> int:
+    def _make_memory(self, stored: ContactMemory) -> Array:
         second = np.where(stored.pairs[:, 1] < 0, self.n_rocks - 1 - stored.pairs[:, 1], stored.pairs[:, 1])
-        known = second < self.first_piece
-        first, second = stored.pairs[known, 0], second[known]
-        n_memory = min(int(known.sum()), self.capacity)
-        memory[:n_memory, contacts.MEMORY_KEY] = (first * contacts.KEY_STEP + second)[:n_memory]
-        memory[:n_memory, contacts.MEMORY_POINT : contacts.MEMORY_POINT + 3] = stored.points[known][:n_memory]
-        memory[:n_memory, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3] = stored.impulses[known][
-            :n_memory
-        ]
-        return n_memory
+        known = np.flatnonzero(second < self.first_piece)[: self.capacity]
+        memory = np.zeros((len(known), contacts.MEMORY_WIDTH))
+        memory[:, contacts.MEMORY_KEY] = stored.pairs[known, 0] * contacts.KEY_STEP + second[known]
+        memory[:, contacts.MEMORY_POINT : contacts.MEMORY_POINT + 3] = stored.points[known]
+        memory[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3] = stored.impulses[known]
+        return memory
 
     def _find_lost(self, positions: Array) -> NDArray[np.bool_]:
         outside = (positions < self._lower_site) | (positions > self._upper_site)
@@ -421,10 +417,10 @@ class NonsmoothEngine:
     ) -> tuple[RockArrays, StepReport] | tuple[None, None]:
         config, n, dt = self.config, self.n_rocks, self.time_step
         book = arrays.book.copy()
-        memory = arrays.memory[: arrays.n_memory]
+        memory = arrays.memory
         n_woken = 0
         if config.reduction == "rest":
-            contacts.sum_impulses(memory, arrays.n_memory, n, self._sums)
+            contacts.sum_impulses(memory, n, self._sums)
             n_woken = reduction.wake(
                 book,
                 arrays.positions,
@@ -443,11 +439,11 @@ class NonsmoothEngine:
         motion.set_bodies(awake, arrays.velocities, self.inverse_mass, self._inverse_inertia, self._bodies)
 
         n_pairs = self._find_pairs(status, awake)
-        places, n_active = contacts.index_memory(
-            memory, arrays.n_memory, n, status, self._active, self._table
-        )
+        places, n_active = contacts.index_memory(memory, n, status, self._active, self._table)
         n_rows = self._find_contacts(n_pairs, memory, self._table[:places])
         rows, body_a, body_b = self._rows, self._body_a, self._body_b
+        if -rows[:n_rows, contacts.GAP].min(initial=0.0) > DEEP_SHARE * config.max_penetration:
+            iterations = max(iterations, RETRY_FACTOR * config.iterations)
         if not warm:
             rows[:n_rows, contacts.IMPULSE : contacts.IMPULSE + 3] = 0.0
 
@@ -478,8 +474,7 @@ class NonsmoothEngine:
             arrays.positions.copy(),
             arrays.velocities.copy(),
             book,
-            np.empty_like(arrays.memory),
-            0,
+            np.empty((self.capacity, contacts.MEMORY_WIDTH)),
         )
         sane = motion.move(
             awake,
@@ -496,17 +491,17 @@ class NonsmoothEngine:
             self._bodies_32[:] = 0.0
             return None, None
         n_memory = contacts.write_memory(
-            n, status, memory, arrays.n_memory, self._active, n_active, rows, n_rows, self._row_key,
+            n, status, memory, self._active, n_active, rows, n_rows, self._row_key,
             self._row_rock, self._rotations, new.memory,
         )  # fmt: skip
-        new.n_memory = min(n_memory, self.capacity)
+        new.memory = new.memory[:n_memory]
         n_rested, n_lost = reduction.rest(
             book, new.positions, new.velocities, self.radius, machine.sensors, dt,
             config.rest.displacement, config.rest.time, config.rest.speed, self._lower_site, self._upper_site,
             config.reduction == "rest",
         )  # fmt: skip
         if n_rested > 0:
-            contacts.sum_impulses(new.memory, new.n_memory, n, self._sums)
+            contacts.sum_impulses(new.memory, n, self._sums)
             reduction.set_references(book, self._sums)
         loaded = rows[:n_rows, contacts.IMPULSE] > 0.0
         depths = -rows[:n_rows, contacts.GAP][loaded]
@@ -525,7 +520,7 @@ class NonsmoothEngine:
             n_lost=n_lost,
             redone=False,
             flagged=max_penetration > config.max_penetration,
-            overflow=n_memory - new.n_memory,
+            overflow=n_memory - len(new.memory),
         )
         return new, report
 
@@ -607,7 +602,7 @@ class NonsmoothEngine:
                 self._pair_a, self._pair_b, n_pairs, self.n_rocks, self.first_plane, self.first_piece,
                 self.planes, self.convex, self.shape, self.scale, self._positions, self._rotations,
                 self._velocities, self.solver_body, self.friction, self.restitution, self.time_step,
-                config.contact_margin, config.manifold_gap, config.face_cosine, memory, table,
+                config.contact_margin, config.manifold_gap, config.face_cosine, config.manifold_points, memory, table,
                 self._axis_keys, self._axes, self._rows, self._body_a, self._body_b, self._row_key,
                 self._row_rock, self._statistics,
             )  # fmt: skip

@@ -94,7 +94,12 @@ class NonsmoothRocks(LeafSystem):
         self._provenance = dict(pile.provenance)
         n = engine.n_rocks
         arrays = engine.make_arrays(pile)
-        self._groups = {name: self.DeclareDiscreteState(values) for name, values in _flatten(arrays).items()}
+        # Memory has room for more points than there are: `counts` tells how many of its rows count.
+        size = {"memory": engine.capacity * contacts.MEMORY_WIDTH}
+        self._groups = {
+            name: self.DeclareDiscreteState(np.pad(values, (0, size.get(name, len(values)) - len(values))))
+            for name, values in _flatten(arrays).items()
+        }
         self._machine = self.DeclareAbstractInputPort("machine_step", Value[object](make_machineless_step()))
         step = self.DeclareCacheEntry(
             "step",
@@ -128,8 +133,7 @@ class NonsmoothRocks(LeafSystem):
             ValueError: not the rocks this system was made for.
         """
         context = self.GetMyMutableContextFromRoot(root_context)
-        for name, values in _flatten(self._engine.make_arrays(pile)).items():
-            context.SetDiscreteState(self._groups[name], values)
+        self._write(context.get_mutable_discrete_state(), _flatten(self._engine.make_arrays(pile)))
 
     def get_pile(self, root_context: Context) -> PileState:
         """Read the rocks' present state, contacts included, from the Diagram's context."""
@@ -152,9 +156,12 @@ class NonsmoothRocks(LeafSystem):
             state["positions"].reshape(n, 3),
             state["velocities"].reshape(n, 6),
             state["book"].reshape(n, reduction.BOOK_WIDTH),
-            state["memory"].reshape(-1, contacts.MEMORY_WIDTH),
-            int(state["counts"][0]),
+            state["memory"].reshape(-1, contacts.MEMORY_WIDTH)[: int(state["counts"][0])],
         )
+
+    def _write(self, discrete: DiscreteValues, values: dict[str, Array]) -> None:
+        for name, flat in values.items():
+            discrete.get_mutable_value(self._groups[name])[: len(flat)] = flat
 
     def _calc_step(self, context: Context, value: Value) -> None:
         machine = self._machine.Eval(context) if self._machine.HasValue(context) else make_machineless_step()
@@ -175,8 +182,7 @@ class NonsmoothRocks(LeafSystem):
             "n_flagged": last[_N_FLAGGED] + report.flagged,
         }
         summary = [float(values[name]) for name in ROCK_SUMMARY]
-        for name, flat in _flatten(step.arrays, np.concatenate([summary, F_B_W])).items():
-            discrete.set_value(self._groups[name], flat)
+        self._write(discrete, _flatten(step.arrays, np.concatenate([summary, F_B_W])))
 
     def _calc_poses(self, context: Context, output: BasicVector) -> None:
         arrays = self._get_arrays(context)
@@ -218,7 +224,7 @@ def _flatten(arrays: RockArrays, report: Array | None = None) -> dict[str, Array
         "velocities": arrays.velocities.reshape(-1),
         "book": arrays.book.reshape(-1),
         "memory": arrays.memory.reshape(-1),
-        "counts": np.array([float(arrays.n_memory)]),
+        "counts": np.array([float(len(arrays.memory))]),
         "report": np.zeros(len(ROCK_SUMMARY) + 6) if report is None else report,
     }
 

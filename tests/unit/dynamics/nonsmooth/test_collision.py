@@ -25,6 +25,8 @@ from drakerock.dynamics.nonsmooth.collision.gjk import (
     OVERLAPPING,
     SEPARATED,
     calc_core_distance,
+    decode_simplex,
+    encode_simplex,
     make_gjk_workspace,
 )
 from drakerock.dynamics.nonsmooth.collision.manifold import make_manifold, make_manifold_workspace
@@ -53,12 +55,16 @@ def draw_pair(rng, reach):
     return shapes, r_a, r_b, p
 
 
-def calc_distance(shapes, r_a, r_b, p, max_distance=100.0, guess=None):
+def search_distance(shapes, r_a, r_b, p, max_distance=100.0, guess=None, simplex=0, scale_b=1.0):
     guess = p if guess is None else guess
     return calc_core_distance(
-        shapes, 0, 1.0, flat(r_a), 1, 1.0, flat(r_b), *map(float, p), *map(float, guess),
-        max_distance, make_gjk_workspace(),
+        shapes, 0, 1.0, flat(r_a), 1, scale_b, flat(r_b), *map(float, p), *map(float, guess),
+        simplex, max_distance, make_gjk_workspace(),
     )  # fmt: skip
+
+
+def calc_distance(*args, **kwargs):
+    return search_distance(*args, **kwargs)[:-1]
 
 
 def calc_penetration(shapes, r_a, r_b, p, history=(0.0, 0.0, 0.0), min_cosine=0.5):
@@ -169,6 +175,38 @@ def test_distance_does_not_depend_on_the_guess(seed):
         np.testing.assert_allclose(one[1:4], two[1:4], atol=1e-4)
 
 
+@settings(max_examples=200, deadline=None)
+@given(seeds)
+def test_a_search_goes_on_from_where_another_ended(seed):
+    """From the simplex of a pose nearby, of another pose, or from a senseless one: the distance is the same."""
+    rng = np.random.default_rng(seed)
+    shapes, r_a, r_b, p = draw_pair(rng, (1.5, 3.0))
+    expected = search_distance(shapes, r_a, r_b, p)
+    assert expected[0] == NEAR
+    turn = Rotation.from_rotvec(rng.normal(scale=rng.choice([1e-3, 0.1, 2.0]), size=3)).as_matrix()
+    earlier = search_distance(shapes, r_a, turn @ r_b, p + rng.normal(scale=0.01, size=3))
+    counts = np.diff(shapes.vertex_start)
+    corners = np.column_stack([rng.integers(0, count, 4) for count in counts[:2]])
+    n_points = int(rng.integers(1, 4))
+    for simplex in (expected[-1], earlier[-1], encode_simplex(corners, n_points)):
+        status, *numbers, _ = search_distance(shapes, r_a, r_b, p, simplex=simplex)
+        assert status == NEAR
+        np.testing.assert_allclose(numbers[:3], expected[1:4], atol=1e-4)
+
+
+@given(st.lists(st.tuples(st.integers(0, 127), st.integers(0, 127)), min_size=1, max_size=3))
+def test_a_simplex_is_a_number(pairs):
+    corners = np.zeros((4, 2), np.int64)
+    corners[: len(pairs)] = pairs
+    code = encode_simplex(corners, len(pairs))
+    assert int(float(code)) == code
+    again = np.zeros((4, 2), np.int64)
+    assert decode_simplex(code, again) == len(pairs)
+    assert np.array_equal(again, corners)
+    corners[0, 1] = 128
+    assert encode_simplex(corners, len(pairs)) == 0
+
+
 def test_far_pairs_are_proven_apart():
     rng = np.random.default_rng(1)
     shapes, r_a, r_b, p = draw_pair(rng, (5.0, 6.0))
@@ -212,19 +250,7 @@ def test_distance_agrees_with_scene_graph(seed):
 
 
 def calc_manifold(shapes, r_a, r_b, p, max_gap=0.005, scale_b=1.0, known=()):
-    status, *v, ax, ay, az = calc_core_distance(
-        shapes,
-        0,
-        1.0,
-        flat(r_a),
-        1,
-        scale_b,
-        flat(r_b),
-        *map(float, p),
-        *map(float, p),
-        1.0,
-        make_gjk_workspace(),
-    )
+    status, *v, ax, ay, az = calc_distance(shapes, r_a, r_b, p, max_distance=1.0, scale_b=scale_b)
     assert status == NEAR
     distance = np.linalg.norm(v)
     n = np.array(v) / distance

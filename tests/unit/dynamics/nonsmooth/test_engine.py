@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from drakerock.dynamics.config import NonsmoothConfig, RestConfig
 from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.nonsmooth import contacts, motion, reduction, solver
-from drakerock.dynamics.nonsmooth.engine import make_machineless_step
+from drakerock.dynamics.nonsmooth import engine as engine_module
+from drakerock.dynamics.nonsmooth.engine import DEEP_SHARE, make_machineless_step
 from drakerock.dynamics.nonsmooth.system import NonsmoothRocks
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.pile.config import RocksConfig
@@ -132,19 +133,19 @@ def test_contact_memory_is_found_again():
     pile = make_pile([[0, 0, 0.25]])
     engine = make_engine(pile, [make_box(0.8, 0.6, 0.5)])
     arrays, _ = run(engine, engine.make_arrays(pile), 0.5)
-    assert arrays.n_memory == 4
+    assert len(arrays.memory) == 4
     sums = np.zeros((1, 3))
-    contacts.sum_impulses(arrays.memory, arrays.n_memory, 1, sums)
+    contacts.sum_impulses(arrays.memory, 1, sums)
     np.testing.assert_allclose(sums[0], [0, 0, engine.mass[0] * 9.81 * 0.01], rtol=1e-4, atol=1e-6)
     table = np.zeros(128, np.int64)
     status, active = np.zeros(1, np.int64), np.zeros(8, np.int64)
-    assert contacts.index_memory(arrays.memory, arrays.n_memory, 1, status, active, table) == (64, 4)
+    assert contacts.index_memory(arrays.memory, 1, status, active, table) == (64, 4)
     table = table[:64]
     key = int(arrays.memory[0, contacts.MEMORY_KEY])
     assert contacts.find_in_memory(key, arrays.memory, table) == 0
     assert contacts.find_in_memory(key + 1, arrays.memory, table) == -1
     # pairs without an awake rock are not searched
-    assert contacts.index_memory(arrays.memory, arrays.n_memory, 1, status + 1, active, table) == (64, 0)
+    assert contacts.index_memory(arrays.memory, 1, status + 1, active, table) == (64, 0)
     assert contacts.find_in_memory(key, arrays.memory, table) == -1
 
 
@@ -169,19 +170,21 @@ def test_a_stored_pile_starts_warm(tmp_path):
     again = engine.make_arrays(loaded)
     for name in ("positions", "quaternions", "velocities"):
         assert np.array_equal(getattr(arrays, name), getattr(again, name))
-    assert again.n_memory == arrays.n_memory
+    assert len(again.memory) == len(arrays.memory)
     # A pile keeps contact points and impulses in single precision, in memory as in the file: what was stored goes on
     # like what was not, bit for bit.
     kept = engine.make_arrays(pile)
-    assert np.array_equal(again.memory[: again.n_memory], kept.memory[: kept.n_memory])
-    assert np.allclose(again.memory[: again.n_memory], arrays.memory[: arrays.n_memory], rtol=1e-6, atol=1e-6)
+    assert np.array_equal(again.memory, kept.memory)
+    # Where searches ended is not stored.
+    columns = slice(contacts.MEMORY_SIMPLEX)
+    assert np.allclose(again.memory[:, columns], arrays.memory[:, columns], rtol=1e-6, atol=1e-6)
     # all awake, it stays where it is; without the contacts it sinks and jumps more
     moved = {}
     for name, start in (("warm", loaded), ("cold", replace(loaded, contacts=None))):
         config = NonsmoothConfig(reduction="none", iterations=3, max_residual=1e9)
         awake = make_engine(start, SHAPES, make_plane_site(planes=5), config=config)
         one, _ = awake.advance(awake.make_arrays(start))
-        moved[name] = np.abs(one.velocities[:, 3:]).max()
+        moved[name] = np.abs(one.velocities[:, 3:]).mean()
     assert moved["warm"] < 0.5 * moved["cold"]
 
 
@@ -206,10 +209,10 @@ def test_rocks_rest_keep_their_forces_and_wake_when_their_load_changes():
     engine, arrays = settle()
     status = arrays.book[:, reduction.STATUS]
     assert (status == 1).mean() > 0.8
-    before = arrays.memory[: arrays.n_memory].copy()
+    before = arrays.memory.copy()
     after, _ = run(engine, arrays, 0.2)
     both_rest = [row for row in before if _rests(row, status, engine.n_rocks)]
-    kept = {tuple(row) for row in after.memory[: after.n_memory]}
+    kept = {tuple(row) for row in after.memory}
     assert all(tuple(row) in kept for row in both_rest)
     # a heavy rock dropped on the heap wakes what it lands on
     top = int(np.argmax(after.positions[:, 2]))
@@ -285,6 +288,24 @@ def test_a_step_that_does_not_converge_is_redone_then_fails(fails):
         assert report.redone
         assert report.flagged
         assert report.residual == residuals[1]
+
+
+def test_a_light_rock_between_a_heavy_one_and_the_floor_is_not_squeezed(monkeypatch):
+    """A block of 18 t comes down at 1 m/s on one of 42 kg: few iterations pass on too little momentum."""
+    velocities = np.zeros((2, 6))
+    velocities[0, 5] = -1.0
+    pile = make_pile([[0, 0, 1.25], [0, 0, 0.125]], size=[1.9, 0.25], velocities=velocities)
+    shapes = [make_box(1.0, 1.0, 1.0)]
+    deepest = {}
+    for share in (DEEP_SHARE, np.inf):
+        monkeypatch.setattr(engine_module, "DEEP_SHARE", share)
+        engine = make_engine(pile, shapes)
+        arrays = engine.make_arrays(pile)
+        deepest[share] = 0.0
+        for _ in range(60):
+            arrays, report = engine.advance(arrays)
+            deepest[share] = max(deepest[share], report.max_penetration)
+    assert deepest[DEEP_SHARE] < engine.config.max_penetration < deepest[np.inf]
 
 
 def test_deep_overlap_recovers_slowly():

@@ -16,12 +16,45 @@ from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, Vector, kern
 
 SEPARATED, NEAR, OVERLAPPING = 1, 0, -1
 MAX_ITERATIONS = 32
+# A simplex in one number: two bits for the number of its points, then for each the corners of A and B.
+CORNER_BITS = 7
+MAX_CORNER = 1 << CORNER_BITS
+
+Workspace = tuple[Array, Array, Array, Array]
 
 
 @kernel
-def make_gjk_workspace() -> tuple[Array, Array, Array]:
-    """Return (points, on_a, weights): the simplex of the difference, its points on A, barycentric weights."""
-    return np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(4)
+def make_gjk_workspace() -> Workspace:
+    """Return (points, on_a, weights, corners).
+
+    The simplex of the difference (4, 3), its points on A (4, 3), barycentric weights (4,), and the corners of A and
+    B (4, 2) that its points are the difference of, counted from each shape's first.
+    """
+    return np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(4), np.zeros((4, 2), np.int64)
+
+
+@kernel
+def encode_simplex(corners: Array, n_points: int) -> int:
+    """Return a simplex of at most three pairs of corners as a number; 0 if it cannot be told."""
+    if n_points > 3:
+        return 0
+    code = n_points
+    for k in range(n_points):
+        if corners[k, 0] >= MAX_CORNER or corners[k, 1] >= MAX_CORNER:
+            return 0
+        code |= (corners[k, 0] | (corners[k, 1] << CORNER_BITS)) << (2 + 2 * CORNER_BITS * k)
+    return code
+
+
+@kernel
+def decode_simplex(code: int, corners: Array) -> int:
+    """Set the pairs of corners of a simplex; return how many there are."""
+    n_points = code & 3
+    for k in range(n_points):
+        pair = code >> (2 + 2 * CORNER_BITS * k)
+        corners[k, 0] = pair & (MAX_CORNER - 1)
+        corners[k, 1] = (pair >> CORNER_BITS) & (MAX_CORNER - 1)
+    return n_points
 
 
 @kernel
@@ -119,6 +152,36 @@ def _calc_weights(points: Array, n_points: int, weights: Array) -> bool:
 
 
 @kernel
+def _is_known(points: Array, n_points: int, x: float, y: float, z: float) -> bool:
+    known = False
+    for k in range(n_points):
+        if points[k, 0] == x and points[k, 1] == y and points[k, 2] == z:
+            known = True
+    return known
+
+
+@kernel
+def _add_point(
+    workspace: Workspace,
+    n_points: int,
+    wx: float,
+    wy: float,
+    wz: float,
+    ax: float,
+    ay: float,
+    az: float,
+    corner_a: int,
+    corner_b: int,
+) -> None:
+    """Add a point of the difference to the simplex; it has no weight yet."""
+    points, on_a, weights, corners = workspace
+    points[n_points, 0], points[n_points, 1], points[n_points, 2] = wx, wy, wz
+    on_a[n_points, 0], on_a[n_points, 1], on_a[n_points, 2] = ax, ay, az
+    weights[n_points] = 0.0
+    corners[n_points, 0], corners[n_points, 1] = corner_a, corner_b
+
+
+@kernel
 def calc_core_distance(
     shapes: ConvexShapes,
     shape_a: int,
@@ -133,9 +196,10 @@ def calc_core_distance(
     gx: float,
     gy: float,
     gz: float,
+    simplex: int,
     max_distance: float,
-    workspace: tuple[Array, Array, Array],
-) -> tuple[int, float, float, float, float, float, float]:
+    workspace: Workspace,
+) -> tuple[int, float, float, float, float, float, float, int]:
     """Find the nearest points of two cores.
 
     Args:
@@ -143,23 +207,59 @@ def calc_core_distance(
         shape_a, scale_a, r_a: A's shape, scale and rotation (9 numbers); likewise B's.
         px, py, pz: from A's origin to B's, in W.
         gx, gy, gz: a guess of the direction from A to B, any length but zero.
+        simplex: the simplex that an earlier search of this pair ended with, where this one starts; or 0.
         max_distance: give up when the cores are proven to be farther apart [m].
         workspace: from `make_gjk_workspace`.
 
     Returns:
-        ``(status, vx, vy, vz, ax, ay, az)``. NEAR: v from A's nearest point to B's, a A's nearest point.
+        ``(status, vx, vy, vz, ax, ay, az, simplex)``. NEAR: v from A's nearest point to B's, a A's nearest point.
         SEPARATED: v an axis on which the cores are farther apart than `max_distance`. OVERLAPPING: no use.
     """
-    points, on_a, weights = workspace
+    points, on_a, weights, corners = workspace
     vertices = shapes.vertices
     first_a, last_a = shapes.vertex_start[shape_a], shapes.vertex_start[shape_a + 1]
     first_b, last_b = shapes.vertex_start[shape_b], shapes.vertex_start[shape_b + 1]
     vx, vy, vz = gx, gy, gz
-    n_points = 0
     last2 = np.inf
     squared = 0.0
     status = NEAR
+    n_points = 0
+    for k in range(decode_simplex(simplex, corners)):
+        corner_a, corner_b = first_a + corners[k, 0], first_b + corners[k, 1]
+        ax, ay, az = get_corner(vertices, corner_a, scale_a, r_a)
+        bx, by, bz = get_corner(vertices, corner_b, scale_b, r_b)
+        wx, wy, wz = px + bx - ax, py + by - ay, pz + bz - az
+        if not _is_known(points, n_points, wx, wy, wz):
+            _add_point(workspace, n_points, wx, wy, wz, ax, ay, az, corner_a - first_a, corner_b - first_b)
+            n_points += 1
+    reduce = n_points > 0
     for _ in range(MAX_ITERATIONS):
+        if reduce:
+            if _calc_weights(points, n_points, weights):
+                return OVERLAPPING, vx, vy, vz, 0.0, 0.0, 0.0, 0
+            kept = 0
+            vx, vy, vz = 0.0, 0.0, 0.0
+            for k in range(n_points):
+                weight = weights[k]
+                if weight > 0.0:
+                    vx += weight * points[k, 0]
+                    vy += weight * points[k, 1]
+                    vz += weight * points[k, 2]
+                    if kept != k:
+                        weights[kept] = weight
+                        corners[kept, 0], corners[kept, 1] = corners[k, 0], corners[k, 1]
+                        for d in range(3):
+                            points[kept, d] = points[k, d]
+                            on_a[kept, d] = on_a[k, d]
+                    kept += 1
+            n_points = kept
+            squared = vx * vx + vy * vy + vz * vz
+            if squared < 1e-10:
+                return OVERLAPPING, vx, vy, vz, 0.0, 0.0, 0.0, 0
+            if squared >= last2 * (1.0 - 1e-12):
+                break
+            last2 = squared
+        reduce = True
         lx, ly, lz = rotate_back(r_a, vx, vy, vz)
         corner_a, _ = find_support(vertices, first_a, last_a, lx, ly, lz)
         lx, ly, lz = rotate_back(r_b, -vx, -vy, -vz)
@@ -169,41 +269,13 @@ def calc_core_distance(
         wx, wy, wz = px + bx - ax, py + by - ay, pz + bz - az
         bound = vx * wx + vy * wy + vz * wz
         if bound > 0.0 and bound * bound > max_distance * max_distance * (vx * vx + vy * vy + vz * vz):
-            return SEPARATED, vx, vy, vz, 0.0, 0.0, 0.0
+            return SEPARATED, vx, vy, vz, 0.0, 0.0, 0.0, 0
         if n_points > 0 and squared - bound <= 1e-9 * squared:
             break
-        known = False
-        for k in range(n_points):
-            if points[k, 0] == wx and points[k, 1] == wy and points[k, 2] == wz:
-                known = True
-        if known:
+        if _is_known(points, n_points, wx, wy, wz):
             break
-        points[n_points, 0], points[n_points, 1], points[n_points, 2] = wx, wy, wz
-        on_a[n_points, 0], on_a[n_points, 1], on_a[n_points, 2] = ax, ay, az
+        _add_point(workspace, n_points, wx, wy, wz, ax, ay, az, corner_a - first_a, corner_b - first_b)
         n_points += 1
-        if _calc_weights(points, n_points, weights):
-            return OVERLAPPING, vx, vy, vz, 0.0, 0.0, 0.0
-        kept = 0
-        vx, vy, vz = 0.0, 0.0, 0.0
-        for k in range(n_points):
-            weight = weights[k]
-            if weight > 0.0:
-                vx += weight * points[k, 0]
-                vy += weight * points[k, 1]
-                vz += weight * points[k, 2]
-                if kept != k:
-                    weights[kept] = weight
-                    for d in range(3):
-                        points[kept, d] = points[k, d]
-                        on_a[kept, d] = on_a[k, d]
-                kept += 1
-        n_points = kept
-        squared = vx * vx + vy * vy + vz * vz
-        if squared < 1e-10:
-            return OVERLAPPING, vx, vy, vz, 0.0, 0.0, 0.0
-        if squared >= last2 * (1.0 - 1e-12):
-            break
-        last2 = squared
     ax, ay, az = 0.0, 0.0, 0.0
     for k in range(n_points):
         ax += weights[k] * on_a[k, 0]
@@ -211,4 +283,4 @@ def calc_core_distance(
         az += weights[k] * on_a[k, 2]
     if math.sqrt(squared) > max_distance:
         status = SEPARATED
-    return status, vx, vy, vz, ax, ay, az
+    return status, vx, vy, vz, ax, ay, az, encode_simplex(corners, n_points)

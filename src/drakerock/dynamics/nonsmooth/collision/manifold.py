@@ -122,11 +122,11 @@ def find_first_point(candidates: Array, n_candidates: int, known: Array, n_known
 def add_spread_points(
     candidates: Array, n_candidates: int, points: Array, n_points: int, min_distance: float
 ) -> int:
-    """Add to the manifold `points` (4, 4) those candidates that are farthest from the points it has.
+    """Add to the manifold `points` (m, 4) those candidates that are farthest from the points it has, up to m.
 
     Known candidates go before others that are not much farther. Returns the number of points.
     """
-    while n_points < MAX_POINTS:
+    while n_points < len(points):
         best = 0.0
         chosen = -1
         for k in range(n_candidates):
@@ -170,7 +170,7 @@ def make_manifold(
     points: Array,
     workspace: tuple[Array, Array, Array],
 ) -> int:
-    """Extend the nearest point of a pair to a manifold of at most four points.
+    """Extend the nearest point of a pair to a manifold of at most as many points as `points` has rows.
 
     Args:
         shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz: as for `calc_core_distance`.
@@ -178,12 +178,12 @@ def make_manifold(
         max_gap: points farther apart than this are left out [m].
         min_cosine: a face belongs to the contact if its normal is within this cosine of the pair's.
         known, n_known: (.., 3) points of the last step that carried load, from A's origin.
-        points: (4, 4) positions (half way between the surfaces, from A's origin) and gaps; row 0 holds the
-            nearest point on entry, rows 1 to 3 are set.
+        points: (m, 4) positions (half way between the surfaces, from A's origin) and gaps; row 0 holds the
+            nearest point on entry, the others are set.
         workspace: from `make_manifold_workspace`.
 
     Returns:
-        the number of points, 1 to 4.
+        the number of points, at least 1.
     """
     face_a, cosine_a = _find_face(shapes, shape_a, r_a, nx, ny, nz)
     face_b, cosine_b = _find_face(shapes, shape_b, r_b, -nx, -ny, -nz)

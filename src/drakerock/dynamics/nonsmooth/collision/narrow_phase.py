@@ -41,8 +41,10 @@ from drakerock.dynamics.nonsmooth.contacts import (
     MEMORY_IMPULSE,
     MEMORY_KEY,
     MEMORY_POINT,
+    MEMORY_SIMPLEX,
     NORMAL,
     RESTITUTION,
+    SIMPLEX,
     TANGENT_1,
     TANGENT_2,
     find_axis,
@@ -154,6 +156,7 @@ def find_contacts(
     margin: float,
     manifold_gap: float,
     face_cosine: float,
+    max_points: int,
     memory: Array,
     table: Array,
     axis_keys: Array,
@@ -184,6 +187,7 @@ def find_contacts(
         margin: contacts are found up to this gap [m].
         manifold_gap: further points of a pair up to this gap [m].
         face_cosine: see `make_manifold`.
+        max_points: points of a pair, MAX_POINTS at most.
         memory, table: loaded points of the last step, see `contacts`.
         axis_keys, axes: cache of separating axes: skips pairs, never changes a result.
         rows, body_a, body_b, row_key, row_rock: set, see `contacts`.
@@ -194,7 +198,7 @@ def find_contacts(
     """
     gjk_workspace = make_gjk_workspace()
     manifold_workspace = make_manifold_workspace()
-    points = np.zeros((MAX_POINTS, 4))
+    points = np.zeros((max_points, 4))
     known_points = np.zeros((MAX_POINTS, 3))
     n_rows = 0
     statistics[:] = 0
@@ -228,6 +232,7 @@ def find_contacts(
                     )
                     n_known += 1
                 row += 1
+        simplex = 0
         if first_plane <= b < first_piece:
             plane = planes[b - first_plane]
             nx, ny, nz = -plane[0], -plane[1], -plane[2]
@@ -274,8 +279,10 @@ def find_contacts(
                 if gx * gx + gy * gy + gz * gz < 1e-12:
                     gx = 1.0
             statistics[1] += 1
-            status, vx, vy, vz, ax, ay, az = calc_core_distance(
-                shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, gx, gy, gz,
+            if remembered >= 0:
+                simplex = int(memory[remembered, MEMORY_SIMPLEX])
+            status, vx, vy, vz, ax, ay, az, simplex = calc_core_distance(
+                shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, gx, gy, gz, simplex,
                 roundings + max_gap, gjk_workspace,
             )  # fmt: skip
             if status == SEPARATED:
@@ -350,6 +357,7 @@ def find_contacts(
             out[ARM_B + 2] = z + positions[a, 2] - positions[b, 2]
             out[FRICTION] = mu
             out[GAP] = points[k, 3]
+            out[SIMPLEX] = simplex
             out[RESTITUTION] = restitution[1] if body_2 > n_rocks else restitution[0]
             out[IMPULSE], out[IMPULSE + 1], out[IMPULSE + 2] = normal, tangent_1, tangent_2
             body_a[n_rows], body_b[n_rows] = body_1, body_2
