@@ -78,7 +78,7 @@ def test_controller_and_machine_parameters_act_on_a_real_study(tmp_path):
     study = load_study(
         find_data("studies", "control_parameters.yaml"),
         [
-            "scenario.site.void_depth=0.6", "scenario.pile.rocks=60", "scenario.pile.emission_height=2.0",
+            "scenario.site.void_depth=0.6", "scenario.pile.rocks=60", "scenario.pile.emission_height=1.8",
             "scenario.pile.emission_reach=1.2", "scenario.pile.settle_speed=0.2", "loadings=1",
             "exploration.sampling.n_initial=2", "exploration.sampling.n_corners=0",
             "exploration.sampling.n_samples=2", "exploration.sampling.n_validation=0", "executor.kind=serial",

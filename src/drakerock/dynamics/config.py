@@ -109,6 +109,13 @@ class PlantEngineConfig(Config):
     contact_model: Literal["point", "hydroelastic"] = "point"
     dissipation: Annotated[float, Field(ge=0, le=5, description="Hunt-Crossley [s/m]; more sinks")] = 1.0
     site_stiffness: Annotated[float, Field(gt=0, description="of floor and walls [N/m]")] = 1e9
+    hydroelastic_modulus: Annotated[
+        float,
+        Field(
+            gt=0,
+            description="of rocks [Pa]; softer, faces carry over small patches, and rocks roll off each other",
+        ),
+    ] = 1e9
     hydroelastic_resolution: Annotated[float, Field(gt=0, description="hint, share of a rock's size")] = 0.5
 
 

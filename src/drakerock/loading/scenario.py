@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from drakerock.config import Config, load_config
 from drakerock.dynamics.config import DynamicsConfig
@@ -14,6 +14,7 @@ from drakerock.dynamics.settling import PileRecipe
 from drakerock.loading.config import LoadingConfig
 from drakerock.machine.config import MachineConfig
 from drakerock.pile.config import PileConfig, RocksConfig, SiteConfig
+from drakerock.pile.emission import make_emitter
 from drakerock.resources import find_data
 
 
@@ -37,6 +38,17 @@ class Scenario(Config):
     dynamics: DynamicsConfig = DynamicsConfig()
     loading: LoadingConfig = LoadingConfig()
     recording: RecordingConfig = RecordingConfig()
+
+    @model_validator(mode="after")
+    def _check_emitter(self) -> Scenario:
+        top = float(make_emitter(self.site, self.pile).high[2])
+        roof = self.site.drift_height - self.site.roof_sag
+        if self.pile.emission_reach > 0 and top > roof:
+            raise ValueError(
+                f"pile.emission_reach: before the brow rocks would appear up to {top:.2f} m, above the roof, which is "
+                f"{roof:.2f} m high at the sides; 0, or lower emission_height or emission_interval"
+            )
+        return self
 
 
 def load_scenario(path: str | Path | None = None, overrides: Sequence[str] = ()) -> Scenario:

@@ -10,6 +10,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
 
+from drakerock.files import make_folder, write_text
 from drakerock.machine import names
 from drakerock.machine.config import MachineConfig
 from drakerock.machine.kinematics import Kinematics, calc_bucket_range, calc_joint_angles, make_kinematics
@@ -73,8 +74,8 @@ def write_machine_page(config: MachineConfig, path: str | Path, *, contact_shape
     visualizer.PublishRecording()
 
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(meshcat.StaticHtml(), encoding="utf-8")
+    make_folder(path.parent)
+    write_text(path, meshcat.StaticHtml())
     return path
 
 

@@ -129,7 +129,8 @@ class Store:
         """Make a store, or open the one of the same study to go on with it. Holds the lock until closed.
 
         Raises:
-            InputError: the folder cannot be written, holds another study, or is in use by another process.
+            InputError: the folder cannot be written, holds another study or one without its database, or is in use
+                by another process.
         """
         folder = Path(folder)
         make_folder(folder)
@@ -140,6 +141,11 @@ class Store:
             lock.close()
             raise InputError(f"{folder}: another process is running this study") from None
         try:
+            if (folder / POINTS).exists() and not (folder / DATABASE).exists():
+                raise InputError(
+                    f"{folder}: {POINTS}/ holds sequences of a study, but {DATABASE} is missing: put it back, or take "
+                    "another folder"
+                )
             db = _connect(folder / DATABASE)
             stored = db.execute("SELECT value FROM meta WHERE key = 'identity'").fetchone()
             if stored and stored[0] != study.calc_identity():

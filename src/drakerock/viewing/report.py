@@ -17,6 +17,7 @@ from plotly.subplots import make_subplots
 
 from drakerock.exploration.analysis import Exploration, summarize
 from drakerock.exploration.problem import Array, format_number
+from drakerock.files import make_folder, write_text
 from drakerock.viewing.exploration_figures import make_figures, save_figures
 
 _CAPTIONS = {
@@ -42,13 +43,13 @@ def write_report(exploration: Exploration, out: Path, title: str = "Exploration"
 
     Returns the paths, the report first. Equal explorations give equal bytes.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     pictures = save_figures(make_figures(exploration), out / "figures")
     images = {path.stem: path.read_bytes() for path in pictures if path.suffix == ".png"}
     report, summary, pareto = out / "report.html", out / "summary.json", out / "pareto.csv"
-    report.write_text(make_report(exploration, images, title), encoding="utf-8")
-    summary.write_text(json.dumps(summarize(exploration), indent=2) + "\n", encoding="utf-8")
-    pareto.write_text(_make_csv(exploration), encoding="utf-8")
+    write_text(report, make_report(exploration, images, title))
+    write_text(summary, json.dumps(summarize(exploration), indent=2) + "\n")
+    write_text(pareto, _make_csv(exploration))
     return [report, summary, pareto, *pictures]
 
 

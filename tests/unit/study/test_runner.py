@@ -239,6 +239,16 @@ def test_a_full_disk_of_a_worker_stops_the_run_and_is_no_failure(tmp_path, behav
     assert status["points"]["done"] == 19
 
 
+def test_finished_sequences_without_their_database_are_not_run_over(tmp_path):
+    with Store.create(tmp_path, make_study()):
+        pass
+    (tmp_path / "points").mkdir(exist_ok=True)
+    (tmp_path / "study.db").unlink()
+    with pytest.raises(InputError, match="study.db is missing: put it back"):
+        Store.create(tmp_path, make_study())
+    assert not (tmp_path / "study.db").exists()
+
+
 def test_two_runs_at_once_are_refused(tmp_path):
     study = make_study()
     with Store.create(tmp_path / "store", study), pytest.raises(InputError, match="another process"):

@@ -29,7 +29,7 @@ def test_an_empty_file_is_the_method(write):
 
 
 def test_scenario_file_and_differences_and_overrides(write):
-    write("base.yaml", seed=4, pile={"rocks": 90, "emission_reach": 1.5})
+    write("base.yaml", seed=4, pile={"rocks": 90, "emission_height": 1.8, "emission_reach": 1.5})
     path = write(scenario_file="base.yaml", scenario={"pile": {"rocks": 70}})
     study = load_study(path, ["scenario.site.drift_width=4.5", "loadings=3"])
     assert (study.scenario.seed, study.scenario.pile.rocks, study.scenario.pile.emission_reach) == (

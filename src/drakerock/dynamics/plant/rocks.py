@@ -83,10 +83,9 @@ def _make_kind(
         properties=properties,
     )
     if dynamics.plant.contact_model == "hydroelastic":
-        # A pressure field of modulus k / radius gives about the point contact's stiffness over a face.
         AddCompliantHydroelasticProperties(
             resolution_hint=dynamics.plant.hydroelastic_resolution * size,
-            hydroelastic_modulus=stiffness / radius,
+            hydroelastic_modulus=dynamics.plant.hydroelastic_modulus,
             properties=properties,
         )
     return inertia, make_convex(shape.vertices, shape.name, size), properties
