@@ -24,6 +24,7 @@ from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.nonsmooth.engine import NonsmoothEngine
 from drakerock.dynamics.nonsmooth.system import NonsmoothRocks, add_nonsmooth_rocks
 from drakerock.dynamics.settling import fetch_pile
+from drakerock.loading.cycle import run_cycle
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.machine.config import MachineConfig
 from drakerock.machine.model import Machine, add_machine, calc_motor_targets
@@ -227,16 +228,16 @@ def run_dig(
         np.zeros((n_steps, len(ROCK_SUMMARY))),
         np.zeros(n_steps),
     )
-    fastest = 0.0
-    cpu = time.process_time()
+    fastest, cpu = 0.0, 0.0
     for k in range(n_steps):
+        cpu -= time.process_time()
         simulator.AdvanceTo((k + 1) * time_step)
+        cpu += time.process_time()
         forces[k] = rocks.GetOutputPort("F_B_W").Eval(context)
         summaries[k] = rocks.GetOutputPort("rock_summary").Eval(context)
         reach[k] = tip.CalcPoseInWorld(plant_context).translation()[0] - start
         if k % 10 == 0:
             fastest = max(fastest, float(np.abs(rocks.get_pile(root).V_WRs[:, 3:]).max()))
-    cpu = time.process_time() - cpu
     after = rocks.get_pile(root)
     X_WB = plant.EvalBodyPoseInWorld(plant_context, bucket)
     local = (after.p_WRs - X_WB.translation()) @ X_WB.rotation().matrix()
@@ -269,14 +270,47 @@ def run_dig(
     }
 
 
+# Where digs are made; how many rocks slide, and with it the cost, differs from place to place [m].
+PLACES = (-1.0, -0.5, 0.0, 0.5, 1.0)
+
+
 def bench_dig(pile: PileState, depth: float, reduction: str) -> None:
-    """A whole dig, machine included."""
-    result = run_dig(pile, make_dig(depth), NonsmoothConfig(reduction=reduction))
-    print(f"dig {depth:g} m, reduction {reduction}: " + ", ".join(f"{k} {v:.4g}" for k, v in result.items()))
+    """Whole digs, machine included; one only with all rocks awake, whose cost does not depend on the place."""
+    costs = []
+    for y in PLACES if reduction == "rest" else (0.0,):
+        result = run_dig(pile, make_dig(depth), NonsmoothConfig(reduction=reduction), y=y)
+        costs.append((result["cpu_s"], result["awake_mean"]))
+        text = ", ".join(f"{k} {v:.4g}" for k, v in result.items())
+        print(f"dig {depth:g} m at y {y:g}, reduction {reduction}: {text}")
+    seconds, awake = np.array(costs).T
+    print(
+        f"dig {depth:g} m, reduction {reduction}: median {np.median(seconds):.1f} CPU s, "
+        f"{1e6 * seconds.sum() / awake.sum() / 1200:.1f} us per awake rock and step"
+    )
+
+
+def bench_idle(pile: PileState, site: SiteConfig) -> float:
+    """Return the median CPU time of a step of the whole Diagram when no rock is awake [s]."""
+    assert pile.contacts is not None
+    resting = replace(pile.contacts, resting=np.ones(len(pile), bool))
+    pile = clear_way(replace(pile, contacts=resting, V_WRs=np.zeros((len(pile), 6))))
+    config = NonsmoothConfig(rest={"wake_load": 1e9, "time": 1e9})
+    simulator, plant, machine, _ = build_dig(pile, lambda _: (0.0, 0.0, 0.0), config, site=site)
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    set_machine_pose(plant, context, machine, x_tip=-9.0, y=0.0, z_tip=0.02)
+    times = []
+    for k in range(150):
+        start = time.process_time()
+        simulator.AdvanceTo((k + 1) * TIME_STEP)
+        times.append(time.process_time() - start)
+    return float(np.median(times[20:]))
 
 
 def bench_scaling(pile: PileState) -> None:
-    """The same shallow dig with four more blocks of the same pile behind it, about 22 000 rocks."""
+    """What four more blocks of the same pile behind it cost, about 26 000 rocks in all.
+
+    The blocks are as much at rest as the pile, so the difference is what resting rocks cost in every step.
+    """
     block = pile.select(pile.p_WRs[:, 0] > 0.6)
     width = SITE.void_depth - 0.5
     n_blocks = 4
@@ -284,21 +318,20 @@ def bench_scaling(pile: PileState) -> None:
     for k in range(1, n_blocks + 1):
         total = total.join(replace(block, p_WRs=block.p_WRs + [k * width, 0.0, 0.0]))
     site = SITE.model_copy(update={"void_depth": SITE.void_depth + n_blocks * width})
-    # They lean on each other now instead of on a wall.
-    engine = make_engine(total, site)
     bench_resting(total, site)
-    arrays = engine.make_arrays(total)
-    for k in range(6000):
-        arrays, report = engine.advance(arrays)
-        if k > 100 and report.n_awake < 0.01 * len(total):
-            break
+    few, many = bench_idle(pile, SITE), bench_idle(total, site)
     print(
-        f"scaling: {len(total)} rocks, {report.n_awake} awake after {k * TIME_STEP:.0f} s without a machine"
+        f"scaling: a step without an awake rock takes {few * 1e3:.2f} ms with {len(pile)} rocks, "
+        f"{many * 1e3:.2f} ms with {len(total)}"
     )
-    total = engine.make_pile(arrays)
-    for rocks, where in ((pile, SITE), (total, site)):
-        result = run_dig(rocks, make_dig(1.0), NonsmoothConfig(), site=where)
-        print(f"scaling: {len(rocks)} rocks: " + ", ".join(f"{k} {v:.4g}" for k, v in result.items()))
+    start = time.process_time()
+    steps = run_cycle(Scenario(), pile).outcome.steps
+    seconds = time.process_time() - start
+    extra = steps * (many - few)
+    print(
+        f"scaling: a loading cycle of {steps} steps takes {seconds:.1f} CPU s with {len(pile)} rocks, "
+        f"{extra:.1f} s more with {len(total)}: times {1.0 + extra / seconds:.2f}"
+    )
 
 
 CASES: dict[str, Callable[[PileState], None]] = {

@@ -244,7 +244,7 @@ def test_finished_sequences_without_their_database_are_not_run_over(tmp_path):
         pass
     (tmp_path / "points").mkdir(exist_ok=True)
     (tmp_path / "study.db").unlink()
-    with pytest.raises(InputError, match="study.db is missing: put it back"):
+    with pytest.raises(InputError, match=r"study\.db is missing: put it back"):
         Store.create(tmp_path, make_study())
     assert not (tmp_path / "study.db").exists()
 
