@@ -1,10 +1,11 @@
 """The nonsmooth engine against the plant engine: the same machine digs the same small piles.
 
-    python benchmarks/compare_engines.py --rocks 300 --seeds 4 --out build/engines.jsonl
+    python benchmarks/compare_engines.py --rocks 300 --seeds 4 --points 1 --out build/engines.jsonl
 
 Each seed is one pile, filled and at rest in the nonsmooth engine, relaxed for a second in each engine with the
-machine standing, then dug with the same motor targets. Finished runs are skipped. `--against hydroelastic`: the plant
-engine with pressure fields over faces instead of single points, five times as dear.
+machine standing, then dug with the same motor targets. Finished runs are skipped. `--points 1`: the nonsmooth engine
+with one contact point per pair, as the plant engine's point contact has it. `--against hydroelastic`: the plant engine
+with pressure fields over faces instead of single points, five times as dear.
 """
 
 from __future__ import annotations
@@ -38,9 +39,12 @@ RELAXING = 1.0
 
 
 def run(pile: PileState, engine: str, site: SiteConfig, depth: float, duration: float) -> dict[str, float]:
+    nonsmooth = engine.startswith("nonsmooth")
     dynamics = DynamicsConfig(
-        rocks="nonsmooth" if engine == "nonsmooth" else "plant",
-        nonsmooth=NonsmoothConfig(reduction="none"),
+        rocks="nonsmooth" if nonsmooth else "plant",
+        nonsmooth=NonsmoothConfig(
+            reduction="none", manifold_points=int(engine.removeprefix("nonsmooth-")) if nonsmooth else 4
+        ),
         plant=PlantEngineConfig(contact_model="hydroelastic" if engine == "hydroelastic" else "point"),
         time_step=TIME_STEP,
     )
@@ -109,6 +113,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rocks", type=int, default=300)
     parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--points", type=int, choices=range(1, 5), default=4)
     parser.add_argument("--duration", type=float, default=10.0)
     parser.add_argument("--against", choices=("plant", "hydroelastic"), default="plant")
     parser.add_argument("--out", type=Path, default=Path("build/engines.jsonl"))
@@ -117,7 +122,7 @@ def main() -> None:
     lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
     results = {(r["seed"], r["engine"]): r for r in map(json.loads, lines)}
     site = SIZES["300"][1]
-    engines = ("nonsmooth", arguments.against)
+    engines = (f"nonsmooth-{arguments.points}", arguments.against)
     for seed in range(arguments.seeds):
         todo = [engine for engine in engines if (seed, engine) not in results]
         if not todo:
@@ -134,7 +139,7 @@ def main() -> None:
     for metric in (*METRICS, "cpu_s"):
         a, b = (np.array([results[s, engine][metric] for s in range(arguments.seeds)]) for engine in engines)
         half = stats.t.ppf(0.95, len(a) - 1) * (a - b).std(ddof=1) / np.sqrt(len(a)) if len(a) > 1 else np.nan
-        text = f"{metric}: nonsmooth {a.mean():.4g}, {engines[1]} {b.mean():.4g}"
+        text = f"{metric}: {engines[0]} {a.mean():.4g}, {engines[1]} {b.mean():.4g}"
         share = 100 / b.mean()
         print(
             f"{text}, difference {share * (a - b).mean():+.1f} ± {share * half:.1f} % (90 %, {len(a)} pairs)"
