@@ -1,9 +1,11 @@
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import matplotlib.image
 import numpy as np
 import pytest
+import shapely
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
@@ -16,6 +18,7 @@ from drakerock.loading.scenario import Scenario
 from drakerock.loading.signal_table import load_signals, save_signals
 from drakerock.pile.config import SiteConfig
 from drakerock.viewing.cycle_figures import (
+    _find_outlines,
     calc_rock_poses,
     draw_height_field,
     draw_scene,
@@ -100,6 +103,14 @@ def test_side_view_is_cut_open_and_top_view_is_whole(recording, heap):
     assert count_polygons(recording, "top", machine=False) == len(heap)
     # Seen from above, the box's two faces are four triangles with one outline.
     assert count_polygons(recording, "top") == len(heap) + 4 + 1
+
+
+def test_outline_of_a_turned_cylinder():
+    """Slivers side by side, whose union on a grid failed."""
+    triangles = np.loadtxt(Path(__file__).with_name("cylinder_from_above.txt")).reshape(-1, 3, 2)
+    covered = shapely.union_all(shapely.polygons(triangles))
+    outlines = shapely.union_all([shapely.Polygon(outline) for outline in _find_outlines(triangles)])
+    assert shapely.area(shapely.symmetric_difference(outlines, covered)) < 0.01 * covered.area
 
 
 def test_curves_and_entry_point_are_drawn_where_they_are(plan):
