@@ -89,7 +89,7 @@ class NonsmoothConfig(Config):
         float,
         Field(
             gt=0,
-            description="overlaps beyond it are flagged; beside a machine, from 3/8 of it on, more iterations [m]",
+            description="overlaps beyond it are flagged, beyond 3/8 of it solved with more iterations [m]",
         ),
     ] = 0.04
     memory_per_rock: Annotated[

@@ -35,9 +35,9 @@ _log = logging.getLogger(__name__)
 GRAVITY = 9.81
 # How far outside the site's box a rock still counts as inside [m].
 SITE_MARGIN = 0.5
-# A step that failed is solved again with this many times the iterations, from a cold start; beside a machine, a step
-# that begins with an overlap beyond this share of the bound is solved with as many at once. A light rock that the
-# machine presses into a jam passes on little of the machine's momentum per iteration, and is squeezed meanwhile.
+# A step that failed is solved again with this many times the iterations, from a cold start; a step that begins with
+# an overlap beyond this share of the bound is solved with as many at once. A light rock that the machine presses into
+# a jammed pile passes on little of the machine's momentum per iteration, and is squeezed meanwhile.
 RETRY_FACTOR = 4
 DEEP_SHARE = 0.375
 
@@ -442,8 +442,7 @@ class NonsmoothEngine:
         places, n_active = contacts.index_memory(memory, n, status, self._active, self._table)
         n_rows = self._find_contacts(n_pairs, memory, self._table[:places])
         rows, body_a, body_b = self._rows, self._body_a, self._body_b
-        deepest = -rows[:n_rows, contacts.GAP].min(initial=0.0)
-        if self.n_machine_bodies > 0 and deepest > DEEP_SHARE * config.max_penetration:
+        if -rows[:n_rows, contacts.GAP].min(initial=0.0) > DEEP_SHARE * config.max_penetration:
             iterations = max(iterations, RETRY_FACTOR * config.iterations)
         if not warm:
             rows[:n_rows, contacts.IMPULSE : contacts.IMPULSE + 3] = 0.0

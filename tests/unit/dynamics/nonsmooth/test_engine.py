@@ -300,7 +300,6 @@ def test_a_light_rock_between_a_heavy_one_and_the_floor_is_not_squeezed(monkeypa
     for share in (DEEP_SHARE, np.inf):
         monkeypatch.setattr(engine_module, "DEEP_SHARE", share)
         engine = make_engine(pile, shapes)
-        engine.n_machine_bodies = 1  # as if the block were a machine
         arrays = engine.make_arrays(pile)
         deepest[share] = 0.0
         for _ in range(60):
