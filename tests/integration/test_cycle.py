@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import InitializeParams, Simulator
 
+from drakerock.dynamics.plant.rocks import PlantRocks
 from drakerock.loading.control import FeedforwardController, Mode
 from drakerock.loading.cycle import run_cycle
 from drakerock.loading.plan_file import save_plan
@@ -225,6 +226,26 @@ def test_motor_speeds_that_are_no_numbers_are_a_failure(small_scenario, pile, mo
     outcome = run_cycle(scenario, replace(pile, contacts=None)).outcome
     assert outcome.status == "failed"
     assert outcome.sim_time_s == pytest.approx(0.3, abs=0.05)
+
+
+def test_rocks_that_are_nowhere_after_a_failure_are_left_where_they_were(small_scenario, pile, monkeypatch):
+    """No pile can hold such a state; the failure is recorded all the same."""
+
+    def lose(self, root):
+        if root.get_time() > 0.3:
+            raise ValueError("p_WRs: not finite")
+        return get_pile_of(self, root)
+
+    def fail(_mode, time):
+        if time > 0.3:
+            raise RuntimeError("the solver failed to converge")
+
+    get_pile_of = PlantRocks.get_pile
+    monkeypatch.setattr(PlantRocks, "get_pile", lose)
+    result = run_cycle(small_scenario, pile, fail)
+    assert result.outcome.status == "failed"
+    assert "failed to converge" in result.outcome.reason
+    assert np.array_equal(result.pile_after.p_WRs, pile.p_WRs)
 
 
 def test_context_can_be_saved_and_repeated(small_scenario, pile):

@@ -408,7 +408,7 @@ class NonsmoothEngine:
         if better.residual > self.config.max_residual:
             raise SimulationFailure(
                 f"rocks: the contact solve did not converge: residual {better.residual:.2g} after "
-                f"{RETRY_FACTOR * iterations} iterations (max_residual {self.config.max_residual:g})"
+                f"{RETRY_FACTOR * iterations} iterations or more (max_residual {self.config.max_residual:g})"
             )
         return again, _mark_redone(better)
 
@@ -443,7 +443,7 @@ class NonsmoothEngine:
         n_rows = self._find_contacts(n_pairs, memory, self._table[:places])
         rows, body_a, body_b = self._rows, self._body_a, self._body_b
         if -rows[:n_rows, contacts.GAP].min(initial=0.0) > DEEP_SHARE * config.max_penetration:
-            iterations = max(iterations, RETRY_FACTOR * config.iterations)
+            iterations *= RETRY_FACTOR
         if not warm:
             rows[:n_rows, contacts.IMPULSE : contacts.IMPULSE + 3] = 0.0
 

@@ -94,12 +94,11 @@ class NonsmoothRocks(LeafSystem):
         self._provenance = dict(pile.provenance)
         n = engine.n_rocks
         arrays = engine.make_arrays(pile)
-        # Memory has room for more points than there are: `counts` tells how many of its rows count.
-        size = {"memory": engine.capacity * contacts.MEMORY_WIDTH}
-        self._groups = {
-            name: self.DeclareDiscreteState(np.pad(values, (0, size.get(name, len(values)) - len(values))))
-            for name, values in _flatten(arrays).items()
-        }
+        values = _flatten(arrays)
+        # Room for more points than there are: `counts` tells how many rows of the memory count.
+        room = engine.capacity * contacts.MEMORY_WIDTH - len(values["memory"])
+        values["memory"] = np.pad(values["memory"], (0, room))
+        self._groups = {name: self.DeclareDiscreteState(flat) for name, flat in values.items()}
         self._machine = self.DeclareAbstractInputPort("machine_step", Value[object](make_machineless_step()))
         step = self.DeclareCacheEntry(
             "step",

@@ -184,7 +184,7 @@ def test_a_stored_pile_starts_warm(tmp_path):
         config = NonsmoothConfig(reduction="none", iterations=3, max_residual=1e9)
         awake = make_engine(start, SHAPES, make_plane_site(planes=5), config=config)
         one, _ = awake.advance(awake.make_arrays(start))
-        moved[name] = np.abs(one.velocities[:, 3:]).mean()
+        moved[name] = np.abs(one.velocities[:, 3:]).max()
     assert moved["warm"] < 0.5 * moved["cold"]
 
 
