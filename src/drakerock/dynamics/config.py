@@ -20,14 +20,14 @@ class RestConfig(Config):
     ] = 0.001
     time: Annotated[float, Field(gt=0, description="... within this time [s]")] = 0.1
     speed: Annotated[float, Field(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
-    wake_load: Annotated[
+    wake_speed: Annotated[
         float,
         Field(
             gt=0,
-            description="it wakes when its contact impulses' sum has changed by this multiple of its weight's",
+            description="it wakes when changes of its contact forces would have given it this speed [m/s] ...",
         ),
-    ] = 1.0
-    wake_steps: Annotated[int, Field(ge=1, description="... for this many steps on end")] = 1
+    ] = 0.1
+    wake_time: Annotated[float, Field(gt=0, description="... within about this time [s]")] = 0.01
     sensor_length: Annotated[
         float, Field(ge=0, le=10, description="rocks this far in front of the bucket are awake [m]")
     ] = 2.0
@@ -40,6 +40,9 @@ class NonsmoothConfig(Config):
     """The nonsmooth engine: stepper, contact solve, collision margins, reduction."""
 
     iterations: Annotated[int, Field(ge=1, le=2000, description="sweeps of the resting stage")] = 50
+    machine_sweeps: Annotated[
+        int, Field(ge=0, le=100, description="further sweeps per sweep over the contacts around the machine")
+    ] = 3
     impact_iterations: Annotated[int, Field(ge=1, le=500, description="sweeps of the impact stage")] = 10
     impact_threshold: Annotated[
         float, Field(gt=0, description="contacts that approach faster are impacts [m/s]")

@@ -29,20 +29,34 @@ TANGENT_STEP = 29  # 2 / trace of the tangential block
 SIMPLEX = 30  # where the search for the nearest points ended, see `gjk.encode_simplex`; or 0
 ROW_WIDTH = 32
 
-# Columns of the memory.
-MEMORY_KEY = 0
-MEMORY_POINT = 1  # 1..3
-MEMORY_IMPULSE = 4  # 4..6
-MEMORY_SIMPLEX = 7
-MEMORY_WIDTH = 8
+# Columns of the memory, in single precision: all of it is copied in every step, also of rocks that rest.
+MEMORY_FIRST = 0  # the pair's bodies
+MEMORY_SECOND = 1
+MEMORY_POINT = 2  # 2..4
+MEMORY_IMPULSE = 5  # 5..7
+MEMORY_SIMPLEX = 8  # 8..9, its lower and its upper bits
+MEMORY_WIDTH = 10  # even: two numbers take the room of one of the context's
 
-# A pair's key is first * KEY_STEP + second: exact in a double.
+# A pair's key is first * KEY_STEP + second; bodies are below it, so they are exact in single precision.
 KEY_STEP = 1 << 20
+SIMPLEX_STEP = 1 << 22
 
 
 @kernel
 def _hash(key: int, mask: int) -> int:
     return ((key * -7046029254386353131) >> 40) & mask
+
+
+@kernel
+def read_key(memory: Array, row: int) -> int:
+    """Return the key of the pair that a row of the memory belongs to."""
+    return int(memory[row, MEMORY_FIRST]) * KEY_STEP + int(memory[row, MEMORY_SECOND])
+
+
+@kernel
+def read_simplex(memory: Array, row: int) -> int:
+    """Return where the search of the row's pair ended, see `gjk.encode_simplex`."""
+    return int(memory[row, MEMORY_SIMPLEX]) + SIMPLEX_STEP * int(memory[row, MEMORY_SIMPLEX + 1])
 
 
 @kernel
@@ -63,8 +77,7 @@ def index_memory(memory: Array, n_rocks: int, status: Array, active: Array, tabl
     """
     n_active = 0
     for row in range(len(memory)):
-        key = int(memory[row, MEMORY_KEY])
-        a, b = key // KEY_STEP, key % KEY_STEP
+        a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
         if status[a] == 0 or (b < n_rocks and status[b] == 0):
             active[n_active] = row
             n_active += 1
@@ -76,7 +89,7 @@ def index_memory(memory: Array, n_rocks: int, status: Array, active: Array, tabl
     last = -1
     for k in range(n_active):
         row = active[k]
-        key = int(memory[row, MEMORY_KEY])
+        key = read_key(memory, row)
         if key != last:
             place = _hash(key, mask)
             while table[place] >= 0:
@@ -92,7 +105,7 @@ def find_in_memory(key: int, memory: Array, table: Array) -> int:
     mask = len(table) - 1
     place = _hash(key, mask)
     while table[place] >= 0:
-        if int(memory[table[place], MEMORY_KEY]) == key:
+        if read_key(memory, table[place]) == key:
             return table[place]
         place = (place + 1) & mask
     return -1
@@ -140,8 +153,7 @@ def write_memory(
         if next_active < n_active and active[next_active] == row:
             next_active += 1
             continue
-        key = int(old[row, MEMORY_KEY])
-        a, b = key // KEY_STEP, key % KEY_STEP
+        a, b = int(old[row, MEMORY_FIRST]), int(old[row, MEMORY_SECOND])
         if status[a] == 3 or (b < n_rocks and status[b] == 3):
             continue
         if n_new < len(new):
@@ -155,8 +167,10 @@ def write_memory(
             continue
         if n_new < len(new):
             a = row_rock[k]
-            new[n_new, MEMORY_KEY] = row_key[k]
-            new[n_new, MEMORY_SIMPLEX] = row[SIMPLEX]
+            new[n_new, MEMORY_FIRST], new[n_new, MEMORY_SECOND] = row_key[k] // KEY_STEP, row_key[k] % KEY_STEP
+            simplex = int(row[SIMPLEX])
+            new[n_new, MEMORY_SIMPLEX] = simplex % SIMPLEX_STEP
+            new[n_new, MEMORY_SIMPLEX + 1] = simplex // SIMPLEX_STEP
             for d in range(3):
                 new[n_new, MEMORY_POINT + d] = (
                     rotations[a, 0, d] * row[ARM_A]
@@ -175,8 +189,7 @@ def sum_impulses(memory: Array, n_rocks: int, sums: Array) -> None:
     """Set `sums` (n, 3) to the sum of the contact impulses on each rock [N s]."""
     sums[:] = 0.0
     for row in range(len(memory)):
-        key = int(memory[row, MEMORY_KEY])
-        a, b = key // KEY_STEP, key % KEY_STEP
+        a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
         for d in range(3):
             sums[a, d] -= memory[row, MEMORY_IMPULSE + d]
         if b < n_rocks:

@@ -85,14 +85,14 @@ class RockArrays:
         positions: (n, 3) [m].
         velocities: (n, 6) angular, translational in W.
         book: (n, reduction.BOOK_WIDTH) status and bookkeeping of the reduction.
-        memory: (m, contacts.MEMORY_WIDTH) loaded contact points; m changes from step to step.
+        memory: (m, contacts.MEMORY_WIDTH) float32, loaded contact points; m changes from step to step.
     """
 
     quaternions: Array
     positions: Array
     velocities: Array
     book: Array
-    memory: Array
+    memory: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +298,7 @@ class NonsmoothEngine:
         book = np.zeros((n, reduction.BOOK_WIDTH))
         book[:, reduction.STATUS] = np.where(self.fixed, FIXED, AWAKE)
         book[:, reduction.ANCHOR : reduction.ANCHOR + 3] = pile.p_WRs
-        memory = np.zeros((0, contacts.MEMORY_WIDTH))
+        memory = np.zeros((0, contacts.MEMORY_WIDTH), np.float32)
         if pile.contacts is not None:
             memory = self._make_memory(pile.contacts)
             if self.config.reduction == "rest":
@@ -306,6 +306,7 @@ class NonsmoothEngine:
                 book[resting, reduction.STATUS] = RESTING
                 sums = np.zeros((n, 3))
                 contacts.sum_impulses(memory, n, sums)
+                book[resting, reduction.ABSORBED : reduction.ABSORBED + 3] = 0.0
                 book[resting, reduction.REFERENCE : reduction.REFERENCE + 3] = sums[resting]
         velocities = pile.V_WRs.copy()
         velocities[book[:, reduction.STATUS] != AWAKE] = 0.0
@@ -324,8 +325,7 @@ class NonsmoothEngine:
     def make_pile(self, arrays: RockArrays, provenance: dict[str, object] | None = None) -> PileState:
         """Return the pile of state arrays, contact memory included."""
         rows = arrays.memory
-        keys = rows[:, contacts.MEMORY_KEY].astype(np.int64)
-        pairs = np.column_stack([keys // contacts.KEY_STEP, keys % contacts.KEY_STEP])
+        pairs = rows[:, [contacts.MEMORY_FIRST, contacts.MEMORY_SECOND]].astype(np.int64)
         kept = pairs[:, 1] < self.first_piece  # the machine's are not the pile's
         pairs, rows = pairs[kept], rows[kept]
         # Surfaces of the site are -1, -2, ...: independent of the number of rocks.
@@ -351,8 +351,9 @@ class NonsmoothEngine:
     def _make_memory(self, stored: ContactMemory) -> Array:
         second = np.where(stored.pairs[:, 1] < 0, self.n_rocks - 1 - stored.pairs[:, 1], stored.pairs[:, 1])
         known = np.flatnonzero(second < self.first_piece)[: self.capacity]
-        memory = np.zeros((len(known), contacts.MEMORY_WIDTH))
-        memory[:, contacts.MEMORY_KEY] = stored.pairs[known, 0] * contacts.KEY_STEP + second[known]
+        memory = np.zeros((len(known), contacts.MEMORY_WIDTH), np.float32)
+        memory[:, contacts.MEMORY_FIRST] = stored.pairs[known, 0]
+        memory[:, contacts.MEMORY_SECOND] = second[known]
         memory[:, contacts.MEMORY_POINT : contacts.MEMORY_POINT + 3] = stored.points[known]
         memory[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3] = stored.impulses[known]
         return memory
@@ -381,12 +382,27 @@ class NonsmoothEngine:
         """Step without a machine; see `step`."""
         return self.step(arrays, make_machineless_step())
 
-    def step(self, arrays: RockArrays, machine: MachineStep) -> tuple[RockArrays, StepReport]:
+    def make_room(self) -> RockArrays:
+        """Return arrays that can hold any state of these rocks, memory of full capacity; contents undefined."""
+        n = self.n_rocks
+        return RockArrays(
+            np.empty((n, 4)),
+            np.empty((n, 3)),
+            np.empty((n, 6)),
+            np.empty((n, reduction.BOOK_WIDTH)),
+            np.empty((self.capacity, contacts.MEMORY_WIDTH), np.float32),
+        )
+
+    def step(
+        self, arrays: RockArrays, machine: MachineStep, room: RockArrays | None = None
+    ) -> tuple[RockArrays, StepReport]:
         """Advance all rocks by one time step, solved together with the machine.
 
         Args:
             arrays: state at t_n; not changed.
             machine: the machine at t_n, see `MachineStep`.
+            room: where the result is written, see `make_room`; new if None. Allocating it anew in every step takes as
+                long as all passes over resting rocks.
 
         Returns:
             state at t_n + dt, and the report.
@@ -399,10 +415,13 @@ class NonsmoothEngine:
             if not motion.are_finite(getattr(arrays, name)):
                 raise SimulationFailure(f"rocks: {name} that are not finite")
         iterations = self.config.iterations
-        new, report = self._try_step(arrays, machine, iterations, warm=True)
+        room = room or self.make_room()
+        new, report = self._try_step(arrays, machine, room, iterations, warm=True)
         if new is not None and report is not None and report.residual <= self.config.max_residual:
             return new, report
-        again, better = self._try_step(arrays, machine, RETRY_FACTOR * iterations, warm=new is not None)
+        again, better = self._try_step(
+            arrays, machine, room, RETRY_FACTOR * iterations, warm=new is not None
+        )
         if again is None or better is None:
             raise SimulationFailure("rocks: the contact solve gave values that are not finite")
         if better.residual > self.config.max_residual:
@@ -413,11 +432,12 @@ class NonsmoothEngine:
         return again, _mark_redone(better)
 
     def _try_step(
-        self, arrays: RockArrays, machine: MachineStep, iterations: int, warm: bool
+        self, arrays: RockArrays, machine: MachineStep, room: RockArrays, iterations: int, warm: bool
     ) -> tuple[RockArrays, StepReport] | tuple[None, None]:
         config, n, dt = self.config, self.n_rocks, self.time_step
-        book = arrays.book.copy()
-        memory = arrays.memory
+        new = replace(room)
+        book, memory = new.book, arrays.memory
+        book[:] = arrays.book
         n_woken = 0
         if config.reduction == "rest":
             contacts.sum_impulses(memory, n, self._sums)
@@ -428,8 +448,8 @@ class NonsmoothEngine:
                 self.mass,
                 self._sums,
                 machine.sensors,
-                config.rest.wake_load * self.gravity * dt,
-                config.rest.wake_steps,
+                config.rest.wake_speed,
+                np.exp(-dt / config.rest.wake_time),
             )
         status = book[:, reduction.STATUS].astype(np.int64)
         awake = np.flatnonzero(status == AWAKE)
@@ -466,16 +486,12 @@ class NonsmoothEngine:
         velocity += machine.free_change
         residual = solver.solve_resting(
             rows, n_rows, body_a, body_b, awake, self._bodies, n, machine.arrays, velocity, iterations,
-            self._packed, self._packed_index, self._bodies_32,
+            config.machine_sweeps, self._packed, self._packed_index, self._bodies_32, self._marks,
         )  # fmt: skip
 
-        new = RockArrays(
-            arrays.quaternions.copy(),
-            arrays.positions.copy(),
-            arrays.velocities.copy(),
-            book,
-            np.empty((self.capacity, contacts.MEMORY_WIDTH)),
-        )
+        new.quaternions[:] = arrays.quaternions
+        new.positions[:] = arrays.positions
+        new.velocities[:] = arrays.velocities
         sane = motion.move(
             awake,
             self._bodies,

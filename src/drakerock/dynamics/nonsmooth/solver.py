@@ -62,6 +62,9 @@ STREAMS = 4
 # Sweeps over the machine's own few, stiffly coupled rows per sweep over the contacts.
 MACHINE_SWEEPS = 4
 
+# Contacts of rocks that are at most this many rocks away from one that touches the machine are its neighbourhood.
+NEIGHBOURHOOD = 2
+
 
 class MachineArrays(NamedTuple):
     """The machine as the solve sees it (v generalised velocities, b bodies that touch rocks, m rows).
@@ -612,6 +615,39 @@ def _pack(rows: Array, n_rows: int, body_a: Array, body_b: Array, packed: Array,
 
 
 @kernel
+def _find_neighbourhood(
+    n_free: int, n_rows: int, body_a: Array, index: Array, n_rocks: int, marks: Array
+) -> Array:
+    """Return the packed rows in the machine's neighbourhood, in their order.
+
+    Args:
+        n_free, n_rows, body_a: the rocks' rows are the first, the machine's the others.
+        index: of the packed rows.
+        n_rocks: see `prepare_rows`.
+        marks: (bodies of the solve,) scratch.
+    """
+    marks[:] = 0
+    for k in range(n_free, n_rows):
+        marks[body_a[k]] = 1
+    for distance in range(1, NEIGHBOURHOOD + 1):
+        for k in range(n_free):
+            a, b = index[k, 0], index[k, 1]
+            if b == n_rocks:
+                continue
+            if marks[a] == distance and marks[b] == 0:
+                marks[b] = distance + 1
+            elif marks[b] == distance and marks[a] == 0:
+                marks[a] = distance + 1
+    near = np.empty(n_free, np.int64)
+    n_near = 0
+    for k in range(n_free):
+        if marks[index[k, 0]] > 0 or marks[index[k, 1]] > 0:
+            near[n_near] = k
+            n_near += 1
+    return near[:n_near]
+
+
+@kernel
 def solve_resting(
     rows: Array,
     n_rows: int,
@@ -623,9 +659,11 @@ def solve_resting(
     machine: MachineArrays,
     velocity: Array,
     iterations: int,
+    machine_sweeps: int,
     packed: Array,
     index: Array,
     bodies_32: Array,
+    marks: Array,
 ) -> float:
     """The resting stage: `iterations` symmetric sweeps, forwards and backwards in turn.
 
@@ -657,6 +695,9 @@ def solve_resting(
     forwards = np.arange(n_free, n_rows)
     backwards = forwards[::-1].copy()
     _pack(rows, n_free, body_a, body_b, packed, index)
+    near = forwards[:0]
+    if machine_sweeps > 0 and n_rows > n_free:
+        near = _find_neighbourhood(n_free, n_rows, body_a, index, n_rocks, marks)
     changed = 0.0
     for iteration in range(iterations):
         if len(machine.row_values) > 0:
@@ -674,6 +715,18 @@ def solve_resting(
             )
             for k in range(n_free - 1, -1, -1):
                 changed += abs(_solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1]))
+        if n_rows == n_free:
+            continue
+        for sweep in range(machine_sweeps):
+            _solve_machine_rows(machine, velocity)
+            if (iteration + sweep) % 2 == 1:
+                for k in near:
+                    _solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1])
+                _solve_machine_contacts(rows, forwards, body_a, body_b, bodies_32, n_rocks, machine, velocity)
+            else:
+                _solve_machine_contacts(rows, backwards, body_a, body_b, bodies_32, n_rocks, machine, velocity)
+                for k in near[::-1]:
+                    _solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1])
     for k in range(n_free):
         for d in range(3):
             rows[index[k, 2], IMPULSE + d] = packed[k, IMPULSE + d]

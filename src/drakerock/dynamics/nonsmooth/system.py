@@ -45,10 +45,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """The solution of one step: the state after it and the report."""
+    """The solution of one step: the state after it, the report, and the room that the state is in."""
 
     arrays: RockArrays
-    report: StepReport
+    report: StepReport | None
+    room: RockArrays
 
 
 class NonsmoothRocks(LeafSystem):
@@ -96,13 +97,13 @@ class NonsmoothRocks(LeafSystem):
         arrays = engine.make_arrays(pile)
         values = _flatten(arrays)
         # Room for more points than there are: `counts` tells how many rows of the memory count.
-        room = engine.capacity * contacts.MEMORY_WIDTH - len(values["memory"])
+        room = engine.capacity * contacts.MEMORY_WIDTH // 2 - len(values["memory"])
         values["memory"] = np.pad(values["memory"], (0, room))
         self._groups = {name: self.DeclareDiscreteState(flat) for name, flat in values.items()}
         self._machine = self.DeclareAbstractInputPort("machine_step", Value[object](make_machineless_step()))
         step = self.DeclareCacheEntry(
             "step",
-            ValueProducer(allocate=lambda: Value[object](object()), calc=self._calc_step),
+            ValueProducer(allocate=self._make_step, calc=self._calc_step),
             {self.xd_ticket(), self._machine.ticket()},
         )
         self._step = step
@@ -155,16 +156,21 @@ class NonsmoothRocks(LeafSystem):
             state["positions"].reshape(n, 3),
             state["velocities"].reshape(n, 6),
             state["book"].reshape(n, reduction.BOOK_WIDTH),
-            state["memory"].reshape(-1, contacts.MEMORY_WIDTH)[: int(state["counts"][0])],
+            state["memory"].view(np.float32).reshape(-1, contacts.MEMORY_WIDTH)[: int(state["counts"][0])],
         )
 
     def _write(self, discrete: DiscreteValues, values: dict[str, Array]) -> None:
         for name, flat in values.items():
             discrete.get_mutable_value(self._groups[name])[: len(flat)] = flat
 
+    def _make_step(self) -> Value:
+        room = self._engine.make_room()
+        return Value[object](_Step(room, None, room))
+
     def _calc_step(self, context: Context, value: Value) -> None:
         machine = self._machine.Eval(context) if self._machine.HasValue(context) else make_machineless_step()
-        value.set_value(_Step(*self._engine.step(self._get_arrays(context), machine)))
+        room = value.get_value().room
+        value.set_value(_Step(*self._engine.step(self._get_arrays(context), machine, room), room))
 
     def _update(self, context: Context, discrete: DiscreteValues) -> None:
         step: _Step = self._step.Eval(context)
@@ -222,7 +228,7 @@ def _flatten(arrays: RockArrays, report: Array | None = None) -> dict[str, Array
         "positions": arrays.positions.reshape(-1),
         "velocities": arrays.velocities.reshape(-1),
         "book": arrays.book.reshape(-1),
-        "memory": arrays.memory.reshape(-1),
+        "memory": arrays.memory.reshape(-1).view(np.float64),  # bits, two numbers in one
         "counts": np.array([float(len(arrays.memory))]),
         "report": np.zeros(len(ROCK_SUMMARY) + 6) if report is None else report,
     }

@@ -141,7 +141,7 @@ def test_contact_memory_is_found_again():
     status, active = np.zeros(1, np.int64), np.zeros(8, np.int64)
     assert contacts.index_memory(arrays.memory, 1, status, active, table) == (64, 4)
     table = table[:64]
-    key = int(arrays.memory[0, contacts.MEMORY_KEY])
+    key = contacts.read_key(arrays.memory, 0)
     assert contacts.find_in_memory(key, arrays.memory, table) == 0
     assert contacts.find_in_memory(key + 1, arrays.memory, table) == -1
     # pairs without an awake rock are not searched
@@ -227,8 +227,7 @@ def test_rocks_rest_keep_their_forces_and_wake_when_their_load_changes():
 
 
 def _rests(row, status, n):
-    key = int(row[contacts.MEMORY_KEY])
-    a, b = key // contacts.KEY_STEP, key % contacts.KEY_STEP
+    a, b = int(row[contacts.MEMORY_FIRST]), int(row[contacts.MEMORY_SECOND])
     return status[a] == 1 and (b >= n or status[b] == 1)
 
 
@@ -238,7 +237,7 @@ def test_the_sensor_wakes_what_is_in_its_box():
     book[:, reduction.STATUS] = 1
     sums = book[:, reduction.REFERENCE : reduction.REFERENCE + 3].copy()
     box = np.concatenate([np.eye(3).reshape(-1), np.zeros(3), [-10, -10, -1], [0.0, 10, 10]])
-    n = reduction.wake(book, arrays.positions, engine.radius, engine.mass, sums, box[None], 0.1, 3)
+    n = reduction.wake(book, arrays.positions, engine.radius, engine.mass, sums, box[None], 0.1, 0.0)
     inside = arrays.positions[:, 0] < engine.radius
     assert n == inside.sum()
     assert ((book[:, reduction.STATUS] == 0) == inside).all()
@@ -343,8 +342,8 @@ def test_another_piles_rocks_are_refused():
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="manifold_gap"):
         NonsmoothConfig(manifold_gap=0.05)
-    with pytest.raises(ValueError, match="wake_load"):
-        RestConfig(wake_load=0.0)
+    with pytest.raises(ValueError, match="wake_speed"):
+        RestConfig(wake_speed=0.0)
 
 
 def test_a_damaged_pile_file_is_refused(tmp_path):

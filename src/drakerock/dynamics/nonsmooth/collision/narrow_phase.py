@@ -39,9 +39,7 @@ from drakerock.dynamics.nonsmooth.contacts import (
     IMPULSE,
     KEY_STEP,
     MEMORY_IMPULSE,
-    MEMORY_KEY,
     MEMORY_POINT,
-    MEMORY_SIMPLEX,
     NORMAL,
     RESTITUTION,
     SIMPLEX,
@@ -49,6 +47,8 @@ from drakerock.dynamics.nonsmooth.contacts import (
     TANGENT_2,
     find_axis,
     find_in_memory,
+    read_key,
+    read_simplex,
 )
 
 # A pair that overlaps deeply may turn its normal from the direction it was pushed in by at most 60 degrees.
@@ -219,7 +219,7 @@ def find_contacts(
         n_known = 0
         if remembered >= 0:
             row = remembered
-            while row < len(memory) and int(memory[row, MEMORY_KEY]) == key:
+            while row < len(memory) and read_key(memory, row) == key:
                 hx += memory[row, MEMORY_IMPULSE]
                 hy += memory[row, MEMORY_IMPULSE + 1]
                 hz += memory[row, MEMORY_IMPULSE + 2]
@@ -280,7 +280,7 @@ def find_contacts(
                     gx = 1.0
             statistics[1] += 1
             if remembered >= 0:
-                simplex = int(memory[remembered, MEMORY_SIMPLEX])
+                simplex = read_simplex(memory, remembered)
             status, vx, vy, vz, ax, ay, az, simplex = calc_core_distance(
                 shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, gx, gy, gz, simplex,
                 roundings + max_gap, gjk_workspace,
@@ -327,7 +327,7 @@ def find_contacts(
                 nearest = match_limit * match_limit
                 found = -1
                 row = remembered
-                while row < len(memory) and int(memory[row, MEMORY_KEY]) == key:
+                while row < len(memory) and read_key(memory, row) == key:
                     distance2 = (
                         (memory[row, MEMORY_POINT] - lx) ** 2
                         + (memory[row, MEMORY_POINT + 1] - ly) ** 2
