@@ -2,13 +2,18 @@
 
     nice python benchmarks/faithfulness.py run 300 --seeds 40 --out build/faithfulness
     nice python benchmarks/faithfulness.py cycles 300 --seeds 40 --out build/faithfulness
+    nice python benchmarks/faithfulness.py states 300 --seeds 8 --out build/faithfulness
     python benchmarks/faithfulness.py table --out build/faithfulness
 
 `run` digs by fixed motor rates; `cycles` plans and drives whole loading cycles of random strategies, which gives
 time, damage and debris too. Each seed is a place and depth of a dig, or a strategy; there are five to a pile (at full
 size all in one), and each is done once per variant. The table gives the mean paired difference against `none` (all
-awake) relative to its mean, with its 90 % confidence interval. Runs that are stored already are skipped, so a study
-can be stopped and continued.
+awake) relative to its mean, with its 90 % confidence interval.
+
+`states` stops a dig every 0.6 s, and each variant goes on from there for 0.2 s. That is too short for chaos, so small
+differences show; what it leaves out is that variants come to different states.
+
+Runs that are stored already are skipped, so a study can be stopped and continued.
 """
 
 from __future__ import annotations
@@ -18,15 +23,19 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.analysis import Simulator
 from rocks import (
     ROCKS,
     SHAPES,
     SITE,
     TIME_STEP,
+    build_dig,
     clear_way,
     get_pile,
     make_dig,
@@ -36,6 +45,7 @@ from rocks import (
 from scipy import stats
 
 from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
+from drakerock.dynamics.nonsmooth.system import NonsmoothRocks
 from drakerock.dynamics.settling import PileRecipe, make_pile
 from drakerock.loading.config import LoadingConfig
 from drakerock.loading.cycle import run_cycle
@@ -58,8 +68,15 @@ VARIANTS: dict[str, tuple[dict[str, object], float]] = {
     "iterations-100": ({"reduction": "none", "iterations": 100}, TIME_STEP),
     "half-step": ({"reduction": "none"}, 0.5 * TIME_STEP),
     "rest-slow": ({"reduction": "rest", "rest": {"displacement": 0.004, "time": 0.3}}, TIME_STEP),
-    "alpha-0.5": ({"reduction": "rest", "rest": {"wake_load": 0.5}}, TIME_STEP),
-    "alpha-2": ({"reduction": "rest", "rest": {"wake_load": 2.0}}, TIME_STEP),
+    "wake-0.05": ({"reduction": "rest", "rest": {"wake_speed": 0.05}}, TIME_STEP),
+    "wake-0.2": ({"reduction": "rest", "rest": {"wake_speed": 0.2}}, TIME_STEP),
+    "no-machine-sweeps": ({"reduction": "none", "machine_sweeps": 0}, TIME_STEP),
+    "iterations-100-no-machine-sweeps": (
+        {"reduction": "none", "iterations": 100, "machine_sweeps": 0},
+        TIME_STEP,
+    ),
+    "iterations-400": ({"reduction": "none", "iterations": 400}, TIME_STEP),
+    "converged": ({"reduction": "none", "iterations": 2000}, TIME_STEP),
 }
 # Making a pile costs as much as several digs; each is at another place and depth.
 DIGS_PER_PILE = 5
@@ -74,6 +91,9 @@ CYCLE_METRICS = (
     "debris_kg",
     "cpu_s",
 )
+STATE_METRICS = ("push_kN", "peak_push_kN", "tip_mm", "cpu_s")
+# Of `states`: time between states, and how long each variant goes on [s]. States without push say nothing [kN].
+STATE_PERIOD, STATE_TIME, MIN_PUSH = 0.6, 0.2, 20.0
 METRICS = ("bucket_mass_kg", "peak_push_kN", "mean_push_kN", "displaced_m3", "reach_m", "cpu_s")
 
 
@@ -94,26 +114,31 @@ def make_small_pile(n: int, site: SiteConfig, height: float, seed: int) -> PileS
     return engine.make_pile(arrays)
 
 
-def list_work(
-    size: str, seeds: range, variants: list[str], path: Path
-) -> Iterator[tuple[int, str, NonsmoothConfig, float, PileState]]:
-    """Yield what is not stored yet: seed, variant, its settings and time step, and the pile it starts from."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+@lru_cache(maxsize=1)
+def get_start(size: str, seed: int) -> PileState:
     n, site, height = SIZES[size]
+    return get_pile() if size == "full" else make_small_pile(n, site, height, seed)
+
+
+def start_at_rest(size: str, seed: int, reduction: object) -> PileState:
+    """Return the pile of a seed; with reduction all is at rest, so that its rules are what differs."""
+    pile = get_start(size, 0 if size == "full" else seed // DIGS_PER_PILE)
+    contacts = replace(pile.contacts, resting=np.full(len(pile), reduction == "rest"))
+    return replace(pile, contacts=contacts, V_WRs=np.zeros((len(pile), 6)))
+
+
+def list_work(seeds: range, variants: list[str], path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the seed and variant of what is not stored yet."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     done = {(r["seed"], r["variant"]) for r in read(path)}
-    made = -1
-    for seed, name in product(seeds, variants):
-        if (seed, name) in done:
-            continue
-        number = 0 if size == "full" else seed // DIGS_PER_PILE
-        if number != made:
-            pile = get_pile() if size == "full" else make_small_pile(n, site, height, number)
-            made = number
-        settings, time_step = VARIANTS[name]
-        # Reduction starts with all at rest, so that its rules are what differs.
-        contacts = replace(pile.contacts, resting=np.full(len(pile), settings["reduction"] == "rest"))
-        start = replace(pile, contacts=contacts, V_WRs=np.zeros((len(pile), 6)))
-        yield seed, name, NonsmoothConfig(**settings), time_step, start
+    yield from (work for work in product(seeds, variants) if work not in done)
+
+
+def draw_dig(seed: int, site: SiteConfig) -> tuple[float, float]:
+    """Return depth and place of a seed's dig [m]."""
+    rng = np.random.default_rng(1000 + seed)
+    free = 0.5 * site.drift_width - 1.7
+    return rng.uniform(0.8, 2.5), rng.uniform(-free, free)
 
 
 def store(path: Path, seed: int, variant: str, values: dict[str, float], metrics: Sequence[str]) -> None:
@@ -125,11 +150,10 @@ def store(path: Path, seed: int, variant: str, values: dict[str, float], metrics
 def run(size: str, seeds: range, variants: list[str], out: Path) -> None:
     """Digs by fixed rates, each at another place and depth."""
     site, path = SIZES[size][1], out / f"{size}.jsonl"
-    free = 0.5 * site.drift_width - 1.7
-    for seed, name, config, time_step, pile in list_work(size, seeds, variants, path):
-        rng = np.random.default_rng(1000 + seed)
-        depth, y = rng.uniform(0.8, 2.5), rng.uniform(-free, free)
-        result = run_dig(clear_way(pile), make_dig(depth), config, 12.0, time_step, site, y)
+    for seed, name in list_work(seeds, variants, path):
+        settings, time_step = VARIANTS[name]
+        pile, (depth, y) = start_at_rest(size, seed, settings["reduction"]), draw_dig(seed, site)
+        result = run_dig(pile, make_dig(depth), NonsmoothConfig(**settings), 12.0, time_step, site, y)
         store(path, seed, name, result, METRICS)
 
 
@@ -137,14 +161,16 @@ def run_cycles(size: str, seeds: range, variants: list[str], out: Path) -> None:
     """Whole loading cycles, each of a strategy drawn from the method's ranges."""
     n, site, height = SIZES[size]
     path = out / f"{size}-cycles.jsonl"
-    for seed, name, config, time_step, pile in list_work(size, seeds, variants, path):
+    for seed, name in list_work(seeds, variants, path):
+        settings, time_step = VARIANTS[name]
+        pile = start_at_rest(size, seed, settings["reduction"])
         rng = np.random.default_rng(2000 + seed)
         strategy = dict(zip(STRATEGY, rng.uniform(*np.transpose(list(STRATEGY.values()))), strict=True))
         scenario = Scenario(
             seed=seed,
             site=site,
             pile=PileConfig(rocks=n or None, emission_height=height),
-            dynamics=DynamicsConfig(nonsmooth=config, time_step=time_step),
+            dynamics=DynamicsConfig(nonsmooth=NonsmoothConfig(**settings), time_step=time_step),
             loading=LoadingConfig(strategy=strategy),
         )
         cpu = time.process_time()
@@ -169,6 +195,58 @@ def run_cycles(size: str, seeds: range, variants: list[str], out: Path) -> None:
                 "cpu_s": cpu,
             }
         store(path, seed, name, values, CYCLE_METRICS)
+
+
+def run_states(size: str, seeds: range, variants: list[str], out: Path) -> None:
+    """What each variant makes of the same states of a dig (with `rest`; the others wake all rocks first)."""
+    site, path = SIZES[size][1], out / f"{size}-states.jsonl"
+    missing: dict[int, list[str]] = {}
+    for seed, name in list_work(seeds, variants, path):
+        missing.setdefault(seed, []).append(name)
+    for seed, names in missing.items():
+        pile, (depth, y) = start_at_rest(size, seed, "rest"), draw_dig(seed, site)
+        simulator, plant, _, rocks = build_dig(
+            clear_way(pile), make_dig(depth), NonsmoothConfig(), TIME_STEP, site, y
+        )
+        found: dict[str, list[dict[str, float]]] = {name: [] for name in names}
+        for t in np.arange(STATE_PERIOD, 9.0, STATE_PERIOD):
+            simulator.AdvanceTo(t)
+            for name in names:
+                settings = NonsmoothConfig(**VARIANTS[name][0])
+                found[name].append(continue_dig(simulator, plant, rocks, settings))
+        for name in names:
+            values = {metric: [one[metric] for one in found[name]] for metric in STATE_METRICS}
+            with open(path, "a", encoding="utf-8") as file:
+                file.write(json.dumps({"seed": seed, "variant": name, **values}) + "\n")
+            print(path.stem, seed, name, {k: np.round(np.mean(v), 3) for k, v in values.items()}, flush=True)
+
+
+def continue_dig(
+    simulator: Simulator, plant: MultibodyPlant, rocks: NonsmoothRocks, settings: NonsmoothConfig
+) -> dict[str, float]:
+    """Go on for `STATE_TIME` from a copy of the simulator's context with other settings."""
+    usual = rocks.engine.config
+    rocks.engine.config = settings
+    try:
+        other = Simulator(simulator.get_system(), simulator.get_context().Clone())
+        root = other.get_mutable_context()
+        context = rocks.GetMyMutableContextFromRoot(root)
+        # The step's solution is to be found anew.
+        context.get_mutable_discrete_state()
+        tip = plant.GetFrameByName("tip")
+        plant_context = plant.GetMyContextFromRoot(root)
+        forces, start, cpu = [], root.get_time(), time.process_time()
+        for k in range(round(STATE_TIME / TIME_STEP)):
+            other.AdvanceTo(start + (k + 1) * TIME_STEP)
+            forces.append(-rocks.GetOutputPort("F_B_W").Eval(context)[3] / 1e3)
+        return {
+            "push_kN": float(np.mean(forces)),
+            "peak_push_kN": float(np.max(forces)),
+            "tip_mm": float(tip.CalcPoseInWorld(plant_context).translation()[0]) * 1e3,
+            "cpu_s": time.process_time() - cpu,
+        }
+    finally:
+        rocks.engine.config = usual
 
 
 def read(path: Path) -> list[dict]:
@@ -201,10 +279,33 @@ def print_table(out: Path, baseline: str = "none") -> None:
         print()
 
 
+def print_states(out: Path, baselines: Sequence[str] = ("none", "converged")) -> None:
+    """Print what variants make of the same states: mean difference with its 90 % interval, all states together."""
+    print("| rocks | variant | against | states | push | peak push | tip [mm] | CPU time |")
+    print("|---|---|---|---|---|---|---|---|")
+    for size in SIZES:
+        results = {(r["variant"], r["seed"]): r for r in read(out / f"{size}-states.jsonl")}
+        for baseline, variant in product(baselines, VARIANTS):
+            seeds = [s for v, s in results if v == variant and (baseline, s) in results]
+            if variant == baseline or not seeds:
+                continue
+            cells = []
+            pushed = np.concatenate([results[baseline, s]["push_kN"] for s in seeds]) > MIN_PUSH
+            for metric in STATE_METRICS:
+                a, b = (
+                    np.concatenate([results[v, s][metric] for s in seeds])[pushed]
+                    for v in (variant, baseline)
+                )
+                scale, unit = (1.0, "") if metric == "tip_mm" else (100.0 / b.mean(), " %")
+                half = stats.t.ppf(0.95, len(a) - 1) * (a - b).std(ddof=1) / np.sqrt(len(a))
+                cells.append(f"{scale * (a - b).mean():+.1f} ± {scale * half:.1f}{unit}")
+            print(f"| {size} | {variant} | {baseline} | {pushed.sum()} | " + " | ".join(cells) + " |")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    for name in ("run", "cycles"):
+    for name in ("run", "cycles", "states"):
         one = commands.add_parser(name)
         one.add_argument("size", choices=SIZES)
         one.add_argument("--seeds", type=int, default=40)
@@ -216,9 +317,10 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.command == "table":
         print_table(arguments.out)
+        print_states(arguments.out)
     else:
         seeds = range(arguments.first, arguments.first + arguments.seeds)
-        work = run if arguments.command == "run" else run_cycles
+        work = {"run": run, "cycles": run_cycles, "states": run_states}[arguments.command]
         work(arguments.size, seeds, arguments.variants, arguments.out)
 
 

@@ -167,7 +167,10 @@ def write_memory(
             continue
         if n_new < len(new):
             a = row_rock[k]
-            new[n_new, MEMORY_FIRST], new[n_new, MEMORY_SECOND] = row_key[k] // KEY_STEP, row_key[k] % KEY_STEP
+            new[n_new, MEMORY_FIRST], new[n_new, MEMORY_SECOND] = (
+                row_key[k] // KEY_STEP,
+                row_key[k] % KEY_STEP,
+            )
             simplex = int(row[SIMPLEX])
             new[n_new, MEMORY_SIMPLEX] = simplex % SIMPLEX_STEP
             new[n_new, MEMORY_SIMPLEX + 1] = simplex // SIMPLEX_STEP

@@ -419,9 +419,7 @@ class NonsmoothEngine:
         new, report = self._try_step(arrays, machine, room, iterations, warm=True)
         if new is not None and report is not None and report.residual <= self.config.max_residual:
             return new, report
-        again, better = self._try_step(
-            arrays, machine, room, RETRY_FACTOR * iterations, warm=new is not None
-        )
+        again, better = self._try_step(arrays, machine, room, RETRY_FACTOR * iterations, warm=new is not None)
         if again is None or better is None:
             raise SimulationFailure("rocks: the contact solve gave values that are not finite")
         if better.residual > self.config.max_residual:
@@ -451,6 +449,8 @@ class NonsmoothEngine:
                 config.rest.wake_speed,
                 np.exp(-dt / config.rest.wake_time),
             )
+        else:
+            reduction.wake_all(book, arrays.positions)
         status = book[:, reduction.STATUS].astype(np.int64)
         awake = np.flatnonzero(status == AWAKE)
         self._velocities[:n] = arrays.velocities

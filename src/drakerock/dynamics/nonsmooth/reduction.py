@@ -94,6 +94,14 @@ def wake_rock(book: Array, positions: Array, i: int) -> None:
 
 
 @kernel
+def wake_all(book: Array, positions: Array) -> None:
+    """Wake all resting rocks (`reduction: none`)."""
+    for i in range(len(book)):
+        if book[i, STATUS] == RESTING:
+            wake_rock(book, positions, i)
+
+
+@kernel
 def rest(
     book: Array,
     positions: Array,

@@ -724,7 +724,9 @@ def solve_resting(
                     _solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1])
                 _solve_machine_contacts(rows, forwards, body_a, body_b, bodies_32, n_rocks, machine, velocity)
             else:
-                _solve_machine_contacts(rows, backwards, body_a, body_b, bodies_32, n_rocks, machine, velocity)
+                _solve_machine_contacts(
+                    rows, backwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
+                )
                 for k in near[::-1]:
                     _solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1])
     for k in range(n_free):

@@ -142,8 +142,7 @@ class NonsmoothRocks(LeafSystem):
 
     def get_report(self, root_context: Context) -> StepReport:
         """Return the report of the step that starts at the Diagram's context (solved if it is not yet)."""
-        report: StepReport = self._step.Eval(self.GetMyContextFromRoot(root_context)).report
-        return report
+        return self._solve(self.GetMyContextFromRoot(root_context))[1]
 
     def _get_arrays(self, context: Context) -> RockArrays:
         n = self._engine.n_rocks
@@ -172,9 +171,13 @@ class NonsmoothRocks(LeafSystem):
         room = value.get_value().room
         value.set_value(_Step(*self._engine.step(self._get_arrays(context), machine, room), room))
 
-    def _update(self, context: Context, discrete: DiscreteValues) -> None:
+    def _solve(self, context: Context) -> tuple[RockArrays, StepReport]:
         step: _Step = self._step.Eval(context)
-        report = step.report
+        assert step.report is not None
+        return step.arrays, step.report
+
+    def _update(self, context: Context, discrete: DiscreteValues) -> None:
+        arrays, report = self._solve(context)
         last = context.get_discrete_state(self._groups["report"]).value()
         F_B_W = np.zeros(6) if self._layout is None else report.F_Bs_W[self._layout.bucket]
         values = {
@@ -187,7 +190,7 @@ class NonsmoothRocks(LeafSystem):
             "n_flagged": last[_N_FLAGGED] + report.flagged,
         }
         summary = [float(values[name]) for name in ROCK_SUMMARY]
-        self._write(discrete, _flatten(step.arrays, np.concatenate([summary, F_B_W])))
+        self._write(discrete, _flatten(arrays, np.concatenate([summary, F_B_W])))
 
     def _calc_poses(self, context: Context, output: BasicVector) -> None:
         arrays = self._get_arrays(context)
@@ -206,7 +209,7 @@ class NonsmoothRocks(LeafSystem):
         output.SetFromVector(context.get_discrete_state(self._groups["report"]).value()[len(ROCK_SUMMARY) :])
 
     def _calc_spatial_forces(self, context: Context, output: Value) -> None:
-        report: StepReport = self._step.Eval(context).report
+        _, report = self._solve(context)
         forces = []
         for index, F_B_W in zip(self._body_indices, report.F_Bs_W, strict=True):
             if F_B_W.any():

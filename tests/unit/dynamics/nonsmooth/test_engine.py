@@ -17,7 +17,8 @@ from drakerock.dynamics.config import NonsmoothConfig, RestConfig
 from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.nonsmooth import contacts, motion, reduction, solver
 from drakerock.dynamics.nonsmooth import engine as engine_module
-from drakerock.dynamics.nonsmooth.engine import DEEP_SHARE, make_machineless_step
+from drakerock.dynamics.nonsmooth.collision import gjk
+from drakerock.dynamics.nonsmooth.engine import DEEP_SHARE, MachinePiece, MachineStep, make_machineless_step
 from drakerock.dynamics.nonsmooth.system import NonsmoothRocks
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.pile.config import RocksConfig
@@ -231,6 +232,92 @@ def _rests(row, status, n):
     return status[a] == 1 and (b >= n or status[b] == 1)
 
 
+@pytest.mark.parametrize(("share", "kept", "steps"), [(0.4, 0.0, None), (0.4, 0.9, 3), (0.05, 0.9, None)])
+def test_a_rock_wakes_when_it_has_absorbed_momentum_enough(share, kept, steps):
+    """Each step a share of what wakes it: at most share / (1 - kept) of it comes together."""
+    speed, mass = 0.1, np.array([50.0])
+    book = np.zeros((1, reduction.BOOK_WIDTH))
+    book[0, reduction.STATUS] = 1
+    book[0, reduction.REFERENCE : reduction.REFERENCE + 3] = [0.0, 0.0, 4.9]
+    sums = np.array([[share * speed * mass[0], 0.0, 4.9]])
+    none = np.zeros((0, 18))
+    woken = [
+        reduction.wake(book, np.zeros((1, 3)), np.ones(1), mass, sums, none, speed, kept) for _ in range(100)
+    ]
+    assert woken.count(1) == (steps is not None)
+    if steps is not None:
+        assert woken.index(1) == steps - 1
+
+
+def test_a_step_into_given_room_is_the_same_step():
+    engine, arrays = settle()
+    arrays.velocities[:, 5] += 0.2
+    arrays.book[:, reduction.STATUS] = 0
+    before = replace(arrays, **{name: value.copy() for name, value in vars(arrays).items()})
+    room = engine.make_room()
+    for array in vars(room).values():
+        array[:] = np.nan
+    expected, _ = engine.advance(arrays)
+    result, _ = engine.step(arrays, make_machineless_step(), room)
+    for name, value in vars(result).items():
+        assert np.array_equal(value, getattr(expected, name)), name
+        assert np.shares_memory(value, getattr(room, name))
+        assert np.array_equal(getattr(arrays, name), getattr(before, name))
+
+
+def test_two_contexts_keep_their_solutions_apart():
+    """The solution of a context is not lost when that of its clone is found."""
+    pile = draw_pile(3, 20)
+    system = NonsmoothRocks(make_engine(pile, SHAPES, make_plane_site(planes=5)), pile)
+    one = system.CreateDefaultContext()
+    first = system.get_report(one)
+    other = one.Clone()
+    shifted = replace(pile, p_WRs=pile.p_WRs + [0.0, 0.0, 1.0])
+    system.set_pile(other, shifted)
+    assert system.get_report(other) != first
+    simulator = Simulator(system, one)
+    simulator.AdvanceTo(0.01)
+    expected, _ = run(system.engine, system.engine.make_arrays(pile), 0.01)
+    assert np.array_equal(system.get_pile(simulator.get_context()).p_WRs, expected.positions)
+
+
+def test_memory_keeps_keys_and_simplices_whole():
+    """Their columns are of single precision; the largest numbers have to come back."""
+    memory = np.zeros((1, contacts.MEMORY_WIDTH), np.float32)
+    rows = np.zeros((1, contacts.ROW_WIDTH))
+    corners = np.array([[127, 126], [125, 127], [127, 127]])
+    rows[0, contacts.IMPULSE], rows[0, contacts.SIMPLEX] = 1.0, gjk.encode_simplex(corners, 3)
+    key = (contacts.KEY_STEP - 2) * contacts.KEY_STEP + contacts.KEY_STEP - 1
+    empty = np.zeros(0, np.int64)
+    n = contacts.write_memory(
+        0,
+        empty,
+        memory[:0],
+        empty,
+        0,
+        rows,
+        1,
+        np.array([key]),
+        np.zeros(1, np.int64),
+        np.eye(3)[None],
+        memory,
+    )
+    assert n == 1
+    assert contacts.read_key(memory, 0) == key
+    found = np.zeros((3, 2), np.int64)
+    assert gjk.decode_simplex(contacts.read_simplex(memory, 0), found) == 3
+    assert np.array_equal(found, corners)
+
+
+def test_without_reduction_nothing_rests():
+    engine, arrays = settle()
+    assert (arrays.book[:, reduction.STATUS] == 1).any()
+    engine.config = NonsmoothConfig(reduction="none")
+    after, report = engine.advance(arrays)
+    assert report.n_awake == engine.n_rocks
+    assert not after.book[:, reduction.STATUS].any()
+
+
 def test_the_sensor_wakes_what_is_in_its_box():
     engine, arrays = settle()
     book = arrays.book.copy()
@@ -305,6 +392,55 @@ def test_a_light_rock_between_a_heavy_one_and_the_floor_is_not_squeezed(monkeypa
             arrays, report = engine.advance(arrays)
             deepest[share] = max(deepest[share], report.max_penetration)
     assert deepest[DEEP_SHARE] < engine.config.max_penetration < deepest[np.inf]
+
+
+def make_ram(mass: float, speed: float) -> tuple[MachinePiece, MachineStep]:
+    """A plate that moves along x only."""
+    plate = np.array([[x, y, z] for x in (-1.0, 0.0) for y in (-1, 1) for z in (0.0, 1.0)])
+    jacobian = np.zeros((1, 6, 1))
+    jacobian[0, 3, 0] = 1.0
+    response = jacobian.transpose(0, 2, 1) / mass
+    arrays = solver.MachineArrays(
+        jacobian,
+        np.ascontiguousarray(response),
+        jacobian @ response,
+        np.zeros((0, 1)),
+        np.zeros((0, 1)),
+        np.zeros((0, solver.MACHINE_ROW_WIDTH)),
+    )
+    return MachinePiece(0, plate, 0.5), MachineStep(
+        np.eye(4)[None], np.array([speed]), np.zeros(1), arrays, np.zeros((0, 18))
+    )
+
+
+def test_sweeps_around_the_machine_bring_its_momentum_through_light_rocks():
+    """40 t at 0.3 m/s push three rocks of 21 kg against one that is fixed."""
+    piece, ram = make_ram(40e3, 0.3)
+    width = 0.2
+    x = width * (0.5 + np.arange(4))
+    pile = make_pile(
+        np.column_stack([x, np.zeros(4), np.full(4, 0.5 * width + 0.1)]),
+        size=np.full(4, width),
+        fixed=[False, False, False, True],
+    )
+    left = {}
+    for sweeps, iterations in ((0, 50), (3, 50), (0, 200), (0, 2000)):
+        config = NonsmoothConfig(
+            reduction="none", machine_sweeps=sweeps, iterations=iterations, max_residual=1e9, rounding=1e-6
+        )
+        engine = make_engine(
+            pile, [make_box(1, 1, 1)], config=config, gravity=0.0, pieces=[piece], n_machine_bodies=1
+        )
+        _, report = engine.step(engine.make_arrays(pile), ram)
+        left[sweeps, iterations] = report.machine_velocity[0]
+        # what the rocks got is what the machine lost, however many sweeps there were
+        assert -report.F_Bs_W[0, 3] * engine.time_step == pytest.approx(
+            40e3 * (0.3 - report.machine_velocity[0]), rel=1e-4
+        )
+    brought = {key: 0.3 - value for key, value in left.items()}
+    assert brought[0, 2000] > 5.0 * brought[0, 50]
+    assert brought[3, 50] > 3.0 * brought[0, 50]
+    assert brought[3, 50] == pytest.approx(brought[0, 200], rel=0.15)
 
 
 def test_deep_overlap_recovers_slowly():
