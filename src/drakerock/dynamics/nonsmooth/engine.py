@@ -348,7 +348,7 @@ class NonsmoothEngine:
             memory,
         )
 
-    def _make_memory(self, stored: ContactMemory) -> Array:
+    def _make_memory(self, stored: ContactMemory) -> NDArray[np.float32]:
         second = np.where(stored.pairs[:, 1] < 0, self.n_rocks - 1 - stored.pairs[:, 1], stored.pairs[:, 1])
         known = np.flatnonzero(second < self.first_piece)[: self.capacity]
         memory = np.zeros((len(known), contacts.MEMORY_WIDTH), np.float32)
@@ -611,7 +611,7 @@ class NonsmoothEngine:
             )
         )  # fmt: skip
 
-    def _find_contacts(self, n_pairs: int, memory: Array, table: IntArray) -> int:
+    def _find_contacts(self, n_pairs: int, memory: NDArray[np.float32], table: IntArray) -> int:
         config = self.config
         while True:
             n_rows = narrow_phase.find_contacts(
