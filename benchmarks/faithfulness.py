@@ -68,8 +68,8 @@ VARIANTS: dict[str, tuple[dict[str, object], float]] = {
     "iterations-100": ({"reduction": "none", "iterations": 100}, TIME_STEP),
     "half-step": ({"reduction": "none"}, 0.5 * TIME_STEP),
     "rest-slow": ({"reduction": "rest", "rest": {"displacement": 0.004, "time": 0.3}}, TIME_STEP),
-    "wake-0.05": ({"reduction": "rest", "rest": {"wake_speed": 0.05}}, TIME_STEP),
-    "wake-0.2": ({"reduction": "rest", "rest": {"wake_speed": 0.2}}, TIME_STEP),
+    "alpha-0.5": ({"reduction": "rest", "rest": {"wake_load": 0.5}}, TIME_STEP),
+    "alpha-2": ({"reduction": "rest", "rest": {"wake_load": 2.0}}, TIME_STEP),
     "no-machine-sweeps": ({"reduction": "none", "machine_sweeps": 0}, TIME_STEP),
     "iterations-100-no-machine-sweeps": (
         {"reduction": "none", "iterations": 100, "machine_sweeps": 0},

@@ -93,7 +93,7 @@ def bench_resting(pile: PileState, site: SiteConfig = SITE) -> None:
         flags[middle[:n_awake]] = False
         start = replace(pile, contacts=replace(resting, resting=flags), V_WRs=np.zeros((len(pile), 6)))
         # the count is held: neither waking nor resting
-        engine = make_engine(pile, site, rest={"wake_speed": 1e9, "time": 1e9})
+        engine = make_engine(pile, site, rest={"wake_load": 1e9, "time": 1e9})
         _, median, reports = time_steps(engine, start, 100)
         print(f"resting: {reports[-1].n_awake} awake of {len(pile)}: {median * 1e3:.2f} ms per step")
 
@@ -294,7 +294,7 @@ def bench_idle(pile: PileState, site: SiteConfig) -> float:
     assert pile.contacts is not None
     resting = replace(pile.contacts, resting=np.ones(len(pile), bool))
     pile = clear_way(replace(pile, contacts=resting, V_WRs=np.zeros((len(pile), 6))))
-    config = NonsmoothConfig(rest={"wake_speed": 1e9, "time": 1e9})
+    config = NonsmoothConfig(rest={"wake_load": 1e9, "time": 1e9})
     simulator, plant, machine, _ = build_dig(pile, lambda _: (0.0, 0.0, 0.0), config, site=site)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     set_machine_pose(plant, context, machine, x_tip=-9.0, y=0.0, z_tip=0.02)

@@ -20,14 +20,14 @@ class RestConfig(Config):
     ] = 0.001
     time: Annotated[float, Field(gt=0, description="... within this time [s]")] = 0.1
     speed: Annotated[float, Field(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
-    wake_speed: Annotated[
+    wake_load: Annotated[
         float,
         Field(
             gt=0,
-            description="it wakes when changes of its contact forces would have given it this speed [m/s] ...",
+            description="it wakes when its contact impulses' sum has changed by this multiple of its weight's",
         ),
-    ] = 0.1
-    wake_time: Annotated[float, Field(gt=0, description="... within about this time [s]")] = 0.01
+    ] = 1.0
+    wake_steps: Annotated[int, Field(ge=1, description="... for this many steps on end")] = 1
     sensor_length: Annotated[
         float, Field(ge=0, le=10, description="rocks this far in front of the bucket are awake [m]")
     ] = 2.0

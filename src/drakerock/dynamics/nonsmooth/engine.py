@@ -306,7 +306,6 @@ class NonsmoothEngine:
                 book[resting, reduction.STATUS] = RESTING
                 sums = np.zeros((n, 3))
                 contacts.sum_impulses(memory, n, sums)
-                book[resting, reduction.ABSORBED : reduction.ABSORBED + 3] = 0.0
                 book[resting, reduction.REFERENCE : reduction.REFERENCE + 3] = sums[resting]
         velocities = pile.V_WRs.copy()
         velocities[book[:, reduction.STATUS] != AWAKE] = 0.0
@@ -446,8 +445,8 @@ class NonsmoothEngine:
                 self.mass,
                 self._sums,
                 machine.sensors,
-                config.rest.wake_speed,
-                np.exp(-dt / config.rest.wake_time),
+                config.rest.wake_load * self.gravity * dt,
+                config.rest.wake_steps,
             )
         else:
             reduction.wake_all(book, arrays.positions)

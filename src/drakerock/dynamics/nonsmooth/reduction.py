@@ -12,13 +12,15 @@ from drakerock.dynamics.nonsmooth.compiling import Array, kernel
 
 # Columns of a rock's bookkeeping (all stored in the context).
 STATUS = 0
+# of an awake rock
 STILL_TIME = 1
-ANCHOR = 2  # 2..4 of an awake rock: where it was when its time at rest began
-ABSORBED = 2  # 2..4 of a resting rock: momentum its contacts have given it since [N s]
-REFERENCE = 5  # 5..7 sum of its contact impulses when it came to rest [N s]
-BOOK_WIDTH = 8
+ANCHOR = 2  # 2..4 where the rock was when its time at rest began
+# of a resting rock
+CHANGED_STEPS = 1
+REFERENCE = 2  # 2..4 sum of its contact impulses when it came to rest [N s]
+BOOK_WIDTH = 5
 
-# In STILL_TIME: the rock has just come to rest, its reference is not set yet.
+# In CHANGED_STEPS: the rock has just come to rest, its reference is not set yet.
 NEW = -1.0
 
 
@@ -46,13 +48,10 @@ def wake(
     mass: Array,
     sums: Array,
     sensors: Array,
-    speed: float,
-    kept: float,
+    load: float,
+    steps: int,
 ) -> int:
     """Wake resting rocks.
-
-    A resting rock does not move, so it absorbs what its contacts give it beyond what held it when it came to rest. It
-    wakes when that momentum would have given it some speed; momentum absorbed long ago counts less and less.
 
     Args:
         book: (n, BOOK_WIDTH) changed.
@@ -61,8 +60,8 @@ def wake(
         mass: (n,) [kg].
         sums: (n, 3) sum of the contact impulses on each rock [N s].
         sensors: (k, 18) see `is_sensed`.
-        speed: that wakes [m/s].
-        kept: share of the momentum absorbed before that counts in a step.
+        load: change of the impulse per mass above which a rock wakes [m/s].
+        steps: for how many steps on end.
 
     Returns:
         number of rocks woken.
@@ -71,12 +70,11 @@ def wake(
     for i in range(len(book)):
         if book[i, STATUS] != RESTING:
             continue
-        size2 = 0.0
+        change2 = 0.0
         for d in range(3):
-            absorbed = kept * book[i, ABSORBED + d] + sums[i, d] - book[i, REFERENCE + d]
-            book[i, ABSORBED + d] = absorbed
-            size2 += absorbed * absorbed
-        if size2 > (speed * mass[i]) ** 2 or is_sensed(
+            change2 += (sums[i, d] - book[i, REFERENCE + d]) ** 2
+        book[i, CHANGED_STEPS] = book[i, CHANGED_STEPS] + 1.0 if change2 > (load * mass[i]) ** 2 else 0.0
+        if book[i, CHANGED_STEPS] >= steps or is_sensed(
             positions[i, 0], positions[i, 1], positions[i, 2], radius[i], sensors
         ):
             wake_rock(book, positions, i)
@@ -161,7 +159,7 @@ def rest(
             and not is_sensed(positions[i, 0], positions[i, 1], positions[i, 2], radius[i], sensors)
         ):
             book[i, STATUS] = RESTING
-            book[i, STILL_TIME] = NEW
+            book[i, CHANGED_STEPS] = NEW
             for d in range(6):
                 velocities[i, d] = 0.0
             n_rested += 1
@@ -172,8 +170,7 @@ def rest(
 def set_references(book: Array, sums: Array) -> None:
     """Keep the sum of the contact impulses (n, 3) of the rocks that have just come to rest."""
     for i in range(len(book)):
-        if book[i, STATUS] == RESTING and book[i, STILL_TIME] == NEW:
-            book[i, STILL_TIME] = 0.0
+        if book[i, STATUS] == RESTING and book[i, CHANGED_STEPS] == NEW:
+            book[i, CHANGED_STEPS] = 0.0
             for d in range(3):
-                book[i, ABSORBED + d] = 0.0
                 book[i, REFERENCE + d] = sums[i, d]

@@ -59,9 +59,6 @@ PACKED_TANGENT_STEP = 27
 PACKED_WIDTH = 28
 STREAMS = 4
 
-# Sweeps over the machine's own few, stiffly coupled rows per sweep over the contacts.
-MACHINE_SWEEPS = 4
-
 # Contacts of rocks that are at most this many rocks away from one that touches the machine are its neighbourhood.
 NEIGHBOURHOOD = 2
 
@@ -534,25 +531,24 @@ def _set_row_impulse(machine: MachineArrays, velocity: Array, k: int, impulse: f
 def _solve_machine_rows(machine: MachineArrays, velocity: Array) -> None:
     """Sweep over the machine's own rows: motors, stops, tyres. A normal row is followed by its two of friction."""
     values = machine.row_values
-    for _ in range(MACHINE_SWEEPS):
-        k = 0
-        while k < len(values):
-            normal = int(values[k, NORMAL_ROW])
-            if normal < 0:
-                impulse = _calc_row_impulse(machine, velocity, k)
-                _set_row_impulse(machine, velocity, k, min(max(impulse, values[k, LOWER]), values[k, UPPER]))
-                k += 1
-            else:
-                one = _calc_row_impulse(machine, velocity, k)
-                two = _calc_row_impulse(machine, velocity, k + 1)
-                limit = values[k, UPPER] * values[normal, ROW_IMPULSE]
-                size = math.sqrt(one * one + two * two)
-                if size > limit:
-                    one *= limit / size
-                    two *= limit / size
-                _set_row_impulse(machine, velocity, k, one)
-                _set_row_impulse(machine, velocity, k + 1, two)
-                k += 2
+    k = 0
+    while k < len(values):
+        normal = int(values[k, NORMAL_ROW])
+        if normal < 0:
+            impulse = _calc_row_impulse(machine, velocity, k)
+            _set_row_impulse(machine, velocity, k, min(max(impulse, values[k, LOWER]), values[k, UPPER]))
+            k += 1
+        else:
+            one = _calc_row_impulse(machine, velocity, k)
+            two = _calc_row_impulse(machine, velocity, k + 1)
+            limit = values[k, UPPER] * values[normal, ROW_IMPULSE]
+            size = math.sqrt(one * one + two * two)
+            if size > limit:
+                one *= limit / size
+                two *= limit / size
+            _set_row_impulse(machine, velocity, k, one)
+            _set_row_impulse(machine, velocity, k + 1, two)
+            k += 2
 
 
 @kernel
@@ -667,6 +663,9 @@ def solve_resting(
 ) -> float:
     """The resting stage: `iterations` symmetric sweeps, forwards and backwards in turn.
 
+    Each is followed by `machine_sweeps` over the machine's own rows, its contacts and their neighbourhood. A light rock
+    that the machine presses on others passes on little of the machine's momentum per sweep.
+
     The sweeps over the rocks run in single precision; the velocities are then made anew from the impulses in
     double precision, so that momentum is kept to rounding.
 
@@ -676,12 +675,14 @@ def solve_resting(
         awake: (m,) rocks that can move.
         bodies, machine, velocity: with gravity and free velocities, without the warm start; changed.
         n_rocks: see `prepare_rows`.
-        iterations: number of sweeps.
+        iterations: number of sweeps over all contacts.
+        machine_sweeps: further sweeps about the machine after each.
+        marks: (bodies of the solve,) scratch.
         packed, index, bodies_32: (rows, PACKED_WIDTH) and (n_rocks + 1, BODY_WIDTH) float32, (rows, 3) int32
             scratch; `bodies_32` has to be zero and is left so.
 
     Returns:
-        the residual: the last sweep's change of the normal impulses over their sum.
+        the residual: the last whole sweep's change of the normal impulses over their sum.
     """
     free = np.empty((len(awake), 6))
     for s in range(len(awake)):
@@ -695,40 +696,31 @@ def solve_resting(
     forwards = np.arange(n_free, n_rows)
     backwards = forwards[::-1].copy()
     _pack(rows, n_free, body_a, body_b, packed, index)
-    near = forwards[:0]
-    if machine_sweeps > 0 and n_rows > n_free:
-        near = _find_neighbourhood(n_free, n_rows, body_a, index, n_rocks, marks)
+    everywhere = np.arange(n_free)
+    nearby = _find_neighbourhood(n_free, n_rows, body_a, index, n_rocks, marks)
     changed = 0.0
     for iteration in range(iterations):
-        if len(machine.row_values) > 0:
-            _solve_machine_rows(machine, velocity)
-        changed = 0.0
-        if iteration % 2 == 0:
-            for k in range(n_free):
-                changed += abs(_solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1]))
-            changed += _solve_machine_contacts(
-                rows, forwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
-            )
-        else:
-            changed += _solve_machine_contacts(
-                rows, backwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
-            )
-            for k in range(n_free - 1, -1, -1):
-                changed += abs(_solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1]))
-        if n_rows == n_free:
-            continue
-        for sweep in range(machine_sweeps):
-            _solve_machine_rows(machine, velocity)
-            if (iteration + sweep) % 2 == 1:
-                for k in near:
-                    _solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1])
-                _solve_machine_contacts(rows, forwards, body_a, body_b, bodies_32, n_rocks, machine, velocity)
+        for sweep in range(1 + machine_sweeps):
+            order = everywhere if sweep == 0 else nearby
+            if len(machine.row_values) > 0:
+                _solve_machine_rows(machine, velocity)
+            change = 0.0
+            if (iteration + sweep) % 2 == 0:
+                for c in range(len(order)):
+                    k = order[c]
+                    change += abs(_solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1]))
+                change += _solve_machine_contacts(
+                    rows, forwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
+                )
             else:
-                _solve_machine_contacts(
+                change += _solve_machine_contacts(
                     rows, backwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
                 )
-                for k in near[::-1]:
-                    _solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1])
+                for c in range(len(order) - 1, -1, -1):
+                    k = order[c]
+                    change += abs(_solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1]))
+            if sweep == 0:
+                changed = change
     for k in range(n_free):
         for d in range(3):
             rows[index[k, 2], IMPULSE + d] = packed[k, IMPULSE + d]

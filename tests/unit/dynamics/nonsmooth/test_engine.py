@@ -232,23 +232,6 @@ def _rests(row, status, n):
     return status[a] == 1 and (b >= n or status[b] == 1)
 
 
-@pytest.mark.parametrize(("share", "kept", "steps"), [(0.4, 0.0, None), (0.4, 0.9, 3), (0.05, 0.9, None)])
-def test_a_rock_wakes_when_it_has_absorbed_momentum_enough(share, kept, steps):
-    """Each step a share of what wakes it: at most share / (1 - kept) of it comes together."""
-    speed, mass = 0.1, np.array([50.0])
-    book = np.zeros((1, reduction.BOOK_WIDTH))
-    book[0, reduction.STATUS] = 1
-    book[0, reduction.REFERENCE : reduction.REFERENCE + 3] = [0.0, 0.0, 4.9]
-    sums = np.array([[share * speed * mass[0], 0.0, 4.9]])
-    none = np.zeros((0, 18))
-    woken = [
-        reduction.wake(book, np.zeros((1, 3)), np.ones(1), mass, sums, none, speed, kept) for _ in range(100)
-    ]
-    assert woken.count(1) == (steps is not None)
-    if steps is not None:
-        assert woken.index(1) == steps - 1
-
-
 def test_a_step_into_given_room_is_the_same_step():
     engine, arrays = settle()
     arrays.velocities[:, 5] += 0.2
@@ -324,7 +307,7 @@ def test_the_sensor_wakes_what_is_in_its_box():
     book[:, reduction.STATUS] = 1
     sums = book[:, reduction.REFERENCE : reduction.REFERENCE + 3].copy()
     box = np.concatenate([np.eye(3).reshape(-1), np.zeros(3), [-10, -10, -1], [0.0, 10, 10]])
-    n = reduction.wake(book, arrays.positions, engine.radius, engine.mass, sums, box[None], 0.1, 0.0)
+    n = reduction.wake(book, arrays.positions, engine.radius, engine.mass, sums, box[None], 0.1, 3)
     inside = arrays.positions[:, 0] < engine.radius
     assert n == inside.sum()
     assert ((book[:, reduction.STATUS] == 0) == inside).all()
@@ -478,8 +461,8 @@ def test_another_piles_rocks_are_refused():
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="manifold_gap"):
         NonsmoothConfig(manifold_gap=0.05)
-    with pytest.raises(ValueError, match="wake_speed"):
-        RestConfig(wake_speed=0.0)
+    with pytest.raises(ValueError, match="wake_load"):
+        RestConfig(wake_load=0.0)
 
 
 def test_a_damaged_pile_file_is_refused(tmp_path):
