@@ -15,6 +15,10 @@ from drakerock.dynamics.config import NonsmoothConfig
 from drakerock.viewing.force_network import draw_force_network
 
 
+# When the bucket pushes into the pile [s].
+PUSHING = 4.2
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
@@ -24,7 +28,7 @@ def main() -> None:
     root = simulator.get_mutable_context()
     figure, axes = plt.subplots(2, 1, figsize=(10, 10))
     draw_force_network(axes[0], rocks.get_pile(root), TIME_STEP, reference=2e4)
-    while simulator.get_context().get_time() < 3.0:
+    while simulator.get_context().get_time() < PUSHING:
         simulator.AdvanceTo(simulator.get_context().get_time() + TIME_STEP)
     draw_force_network(axes[1], rocks.get_pile(root), TIME_STEP, reference=2e4)
     tip = plant.GetFrameByName("tip").CalcPoseInWorld(plant.GetMyContextFromRoot(root)).translation()
