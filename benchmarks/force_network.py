@@ -14,7 +14,6 @@ from rocks import TIME_STEP, build_dig, clear_way, get_pile, make_dig
 from drakerock.dynamics.config import NonsmoothConfig
 from drakerock.viewing.force_network import draw_force_network
 
-
 # When the bucket pushes into the pile [s].
 PUSHING = 4.2
 
