@@ -123,7 +123,7 @@ class PileConfig(Config):
     balance_time: Annotated[
         float,
         Field(gt=0, le=30, description="then all rocks are awake for this time: forces find balance [s]"),
-    ] = 1.0
+    ] = 3.0
     contact_gap: Annotated[
         float,
         Field(ge=0, le=0.1, description="rocks nearer than this touch: debris is what touches no pile [m]"),
