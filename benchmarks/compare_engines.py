@@ -5,7 +5,8 @@
 Each seed is one pile, filled and at rest in the nonsmooth engine, relaxed for a second in each engine with the
 machine standing, then dug with the same motor targets. Finished runs are skipped. `--points 1`: the nonsmooth engine
 with one contact point per pair, as the plant engine's point contact has it. `--against hydroelastic`: the plant engine
-with pressure fields over faces instead of single points, five times as dear.
+with pressure fields over faces instead of single points, five times as dear. `--set damping_time=2`: another setting of
+the nonsmooth engine; give it an `--out` of its own.
 """
 
 from __future__ import annotations
@@ -17,11 +18,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from faithfulness import SIZES, make_small_pile
+from faithfulness import SIZES, compare, make_small_pile
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from rocks import ROCKS, SHAPES, TIME_STEP, Motors, clear_way, make_dig
-from scipy import stats
 
 from drakerock.dynamics.assembly import add_plant, add_site
 from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig, PlantEngineConfig
@@ -38,12 +38,16 @@ METRICS = ("bucket_mass_kg", "peak_push_kN", "mean_push_kN", "displaced_m3", "re
 RELAXING = 1.0
 
 
-def run(pile: PileState, engine: str, site: SiteConfig, depth: float, duration: float) -> dict[str, float]:
+def run(
+    pile: PileState, engine: str, site: SiteConfig, depth: float, duration: float, settings: dict[str, float]
+) -> dict[str, float]:
     nonsmooth = engine.startswith("nonsmooth")
     dynamics = DynamicsConfig(
         rocks="nonsmooth" if nonsmooth else "plant",
         nonsmooth=NonsmoothConfig(
-            reduction="none", manifold_points=int(engine.removeprefix("nonsmooth-")) if nonsmooth else 4
+            reduction="none",
+            manifold_points=int(engine.removeprefix("nonsmooth-")) if nonsmooth else 4,
+            **settings,
         ),
         plant=PlantEngineConfig(contact_model="hydroelastic" if engine == "hydroelastic" else "point"),
         time_step=TIME_STEP,
@@ -116,12 +120,14 @@ def main() -> None:
     parser.add_argument("--points", type=int, choices=range(1, 5), default=4)
     parser.add_argument("--duration", type=float, default=10.0)
     parser.add_argument("--against", choices=("plant", "hydroelastic"), default="plant")
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="of the nonsmooth engine")
     parser.add_argument("--out", type=Path, default=Path("build/engines.jsonl"))
     arguments = parser.parse_args()
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
     results = {(r["seed"], r["engine"]): r for r in map(json.loads, lines)}
     site = SIZES["300"][1]
+    settings = {key: float(value) for key, value in (item.split("=") for item in arguments.set)}
     engines = (f"nonsmooth-{arguments.points}", arguments.against)
     for seed in range(arguments.seeds):
         todo = [engine for engine in engines if (seed, engine) not in results]
@@ -131,19 +137,17 @@ def main() -> None:
         pile = replace(pile, V_WRs=np.zeros((len(pile), 6)))
         depth = np.random.default_rng(seed).uniform(0.6, 1.4)
         for engine in todo:
-            result = run(pile, engine, site, depth, arguments.duration)
+            result = run(pile, engine, site, depth, arguments.duration, settings)
             results[seed, engine] = result
             with open(arguments.out, "a", encoding="utf-8") as file:
                 file.write(json.dumps({"seed": seed, "engine": engine, "rocks": len(pile), **result}) + "\n")
             print(seed, engine, len(pile), {k: round(v, 2) for k, v in result.items()}, flush=True)
     for metric in (*METRICS, "cpu_s"):
         a, b = (np.array([results[s, engine][metric] for s in range(arguments.seeds)]) for engine in engines)
-        half = stats.t.ppf(0.95, len(a) - 1) * (a - b).std(ddof=1) / np.sqrt(len(a)) if len(a) > 1 else np.nan
+        mean, half = compare(a, b)
         text = f"{metric}: {engines[0]} {a.mean():.4g}, {engines[1]} {b.mean():.4g}"
         share = 100 / b.mean()
-        print(
-            f"{text}, difference {share * (a - b).mean():+.1f} ± {share * half:.1f} % (90 %, {len(a)} pairs)"
-        )
+        print(f"{text}, difference {share * mean:+.1f} ± {share * half:.1f} % (90 %, {len(a)} pairs)")
 
 
 if __name__ == "__main__":

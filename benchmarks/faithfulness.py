@@ -21,7 +21,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
@@ -68,13 +68,11 @@ VARIANTS: dict[str, tuple[dict[str, object], float]] = {
     "iterations-100": ({"reduction": "none", "iterations": 100}, TIME_STEP),
     "half-step": ({"reduction": "none"}, 0.5 * TIME_STEP),
     "rest-slow": ({"reduction": "rest", "rest": {"displacement": 0.004, "time": 0.3}}, TIME_STEP),
+    "rest-0.2": ({"reduction": "rest", "rest": {"time": 0.2}}, TIME_STEP),
+    "sensor-4": ({"reduction": "rest", "rest": {"sensor_length": 4.0, "sensor_margin": 0.8}}, TIME_STEP),
     "alpha-0.5": ({"reduction": "rest", "rest": {"wake_load": 0.5}}, TIME_STEP),
     "alpha-2": ({"reduction": "rest", "rest": {"wake_load": 2.0}}, TIME_STEP),
     "no-machine-sweeps": ({"reduction": "none", "machine_sweeps": 0}, TIME_STEP),
-    "iterations-100-no-machine-sweeps": (
-        {"reduction": "none", "iterations": 100, "machine_sweeps": 0},
-        TIME_STEP,
-    ),
     "iterations-400": ({"reduction": "none", "iterations": 400}, TIME_STEP),
     "converged": ({"reduction": "none", "iterations": 2000}, TIME_STEP),
 }
@@ -141,10 +139,13 @@ def draw_dig(seed: int, site: SiteConfig) -> tuple[float, float]:
     return rng.uniform(0.8, 2.5), rng.uniform(-free, free)
 
 
-def store(path: Path, seed: int, variant: str, values: dict[str, float], metrics: Sequence[str]) -> None:
+def store(
+    path: Path, seed: int, variant: str, values: Mapping[str, float | list[float]], metrics: Sequence[str]
+) -> None:
     with open(path, "a", encoding="utf-8") as file:
         file.write(json.dumps({"seed": seed, "variant": variant, **values}) + "\n")
-    print(path.stem, seed, variant, {k: round(values[k], 3) for k in metrics if k in values}, flush=True)
+    means = {k: round(float(np.mean(values[k])), 3) for k in metrics if k in values}
+    print(path.stem, seed, variant, means, flush=True)
 
 
 def run(size: str, seeds: range, variants: list[str], out: Path) -> None:
@@ -216,9 +217,7 @@ def run_states(size: str, seeds: range, variants: list[str], out: Path) -> None:
                 found[name].append(continue_dig(simulator, plant, rocks, settings))
         for name in names:
             values = {metric: [one[metric] for one in found[name]] for metric in STATE_METRICS}
-            with open(path, "a", encoding="utf-8") as file:
-                file.write(json.dumps({"seed": seed, "variant": name, **values}) + "\n")
-            print(path.stem, seed, name, {k: np.round(np.mean(v), 3) for k, v in values.items()}, flush=True)
+            store(path, seed, name, values, STATE_METRICS)
 
 
 def continue_dig(
@@ -253,6 +252,12 @@ def read(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
+def compare(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+    """Return the mean of the paired differences a - b and half its 90 % confidence interval."""
+    half = stats.t.ppf(0.95, len(a) - 1) * (a - b).std(ddof=1) / np.sqrt(len(a)) if len(a) > 1 else np.nan
+    return float((a - b).mean()), float(half)
+
+
 def print_table(out: Path, baseline: str = "none") -> None:
     """Print the tables of digs and of cycles; cycles that failed in either variant are left out."""
     for suffix, metrics in (("", METRICS), ("-cycles", CYCLE_METRICS)):
@@ -272,9 +277,8 @@ def print_table(out: Path, baseline: str = "none") -> None:
                 for metric in metrics:
                     a = np.array([results[variant, s][metric] for s in seeds])
                     b = np.array([results[baseline, s][metric] for s in seeds])
-                    mean = (a - b).mean() / b.mean()
-                    half = stats.t.ppf(0.95, len(a) - 1) * (a - b).std(ddof=1) / np.sqrt(len(a)) / b.mean()
-                    cells.append(f"{100 * mean:+.1f} ± {100 * half:.1f} %")
+                    mean, half = compare(a, b)
+                    cells.append(f"{100 * mean / b.mean():+.1f} ± {100 * half / b.mean():.1f} %")
                 print(f"| {size} | {variant} | {len(seeds)} | " + " | ".join(cells) + " |")
         print()
 
@@ -297,8 +301,8 @@ def print_states(out: Path, baselines: Sequence[str] = ("none", "converged")) ->
                     for v in (variant, baseline)
                 )
                 scale, unit = (1.0, "") if metric == "tip_mm" else (100.0 / b.mean(), " %")
-                half = stats.t.ppf(0.95, len(a) - 1) * (a - b).std(ddof=1) / np.sqrt(len(a))
-                cells.append(f"{scale * (a - b).mean():+.1f} ± {scale * half:.1f}{unit}")
+                mean, half = compare(a, b)
+                cells.append(f"{scale * mean:+.1f} ± {scale * half:.1f}{unit}")
             print(f"| {size} | {variant} | {baseline} | {pushed.sum()} | " + " | ".join(cells) + " |")
 
 

@@ -7,7 +7,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from drakerock.dynamics.config import NonsmoothConfig
-from drakerock.dynamics.nonsmooth.engine import NonsmoothEngine, RockArrays, StepReport
+from drakerock.dynamics.nonsmooth.engine import MachineStep, NonsmoothEngine, RockArrays, StepReport
+from drakerock.dynamics.nonsmooth.solver import MACHINE_ROW_WIDTH, MachineArrays
 from drakerock.pile.config import RocksConfig, SiteConfig
 from drakerock.pile.shapes import RockShape
 from drakerock.pile.site import Plane, Site
@@ -86,6 +87,25 @@ def make_engine(
         pile.size,
         pile.fixed,
         **options,
+    )
+
+
+def make_machine_step(X_WBs, velocity, jacobian, response) -> MachineStep:
+    """A machine of b bodies with v velocities, without rows or sensors of its own."""
+    v = len(velocity)
+    return MachineStep(
+        X_WBs,
+        velocity,
+        np.zeros(v),
+        MachineArrays(
+            jacobian,
+            response,
+            jacobian @ response,
+            np.zeros((0, v)),
+            np.zeros((0, v)),
+            np.zeros((0, MACHINE_ROW_WIDTH)),
+        ),
+        np.zeros((0, 18)),
     )
 
 

@@ -10,10 +10,18 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from drakerock.dynamics.config import NonsmoothConfig
-from drakerock.dynamics.nonsmooth.engine import MachinePiece, MachineStep
-from drakerock.dynamics.nonsmooth.solver import MACHINE_ROW_WIDTH, MachineArrays
+from drakerock.dynamics.nonsmooth.engine import MachinePiece
 from drakerock.pile.config import RocksConfig
-from rock_helpers import make_ball, make_box, make_engine, make_pile, make_plane_site, make_shape, run
+from rock_helpers import (
+    make_ball,
+    make_box,
+    make_engine,
+    make_machine_step,
+    make_pile,
+    make_plane_site,
+    make_shape,
+    run,
+)
 
 G = 9.81
 
@@ -56,20 +64,9 @@ def test_sliding_distance():
 
 def make_still_machine(pose, n_bodies=1):
     """A machine that cannot move: no velocities at all."""
-    return MachineStep(
-        np.tile(pose, (n_bodies, 1, 1)),
-        np.zeros(1),
-        np.zeros(1),
-        MachineArrays(
-            np.zeros((n_bodies, 6, 1)),
-            np.zeros((n_bodies, 1, 6)),
-            np.zeros((n_bodies, 6, 6)),
-            np.zeros((0, 1)),
-            np.zeros((0, 1)),
-            np.zeros((0, MACHINE_ROW_WIDTH)),
-        ),
-        np.zeros((0, 18)),
-    )  # fmt: skip
+    return make_machine_step(
+        np.tile(pose, (n_bodies, 1, 1)), np.zeros(1), np.zeros((n_bodies, 6, 1)), np.zeros((n_bodies, 1, 6))
+    )
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.1, 0.5])

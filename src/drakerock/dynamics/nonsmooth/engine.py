@@ -78,7 +78,7 @@ class MachineStep:
 
 @dataclass(eq=False)
 class RockArrays:
-    """All state of n rocks (the arrays of a step's result are new).
+    """All state of n rocks. The arrays of a step's result are new, or in the room that the step was given.
 
     Attributes:
         quaternions: (n, 4) w x y z.

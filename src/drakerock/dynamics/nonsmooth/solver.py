@@ -677,9 +677,9 @@ def solve_resting(
         n_rocks: see `prepare_rows`.
         iterations: number of sweeps over all contacts.
         machine_sweeps: further sweeps about the machine after each.
-        marks: (bodies of the solve,) scratch.
         packed, index, bodies_32: (rows, PACKED_WIDTH) and (n_rocks + 1, BODY_WIDTH) float32, (rows, 3) int32
             scratch; `bodies_32` has to be zero and is left so.
+        marks: (bodies of the solve,) scratch.
 
     Returns:
         the residual: the last whole sweep's change of the normal impulses over their sum.

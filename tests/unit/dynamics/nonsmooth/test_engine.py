@@ -29,6 +29,7 @@ from rock_helpers import (
     make_ball,
     make_box,
     make_engine,
+    make_machine_step,
     make_pile,
     make_plane_site,
     make_shape,
@@ -382,18 +383,9 @@ def make_ram(mass: float, speed: float) -> tuple[MachinePiece, MachineStep]:
     plate = np.array([[x, y, z] for x in (-1.0, 0.0) for y in (-1, 1) for z in (0.0, 1.0)])
     jacobian = np.zeros((1, 6, 1))
     jacobian[0, 3, 0] = 1.0
-    response = jacobian.transpose(0, 2, 1) / mass
-    arrays = solver.MachineArrays(
-        jacobian,
-        np.ascontiguousarray(response),
-        jacobian @ response,
-        np.zeros((0, 1)),
-        np.zeros((0, 1)),
-        np.zeros((0, solver.MACHINE_ROW_WIDTH)),
-    )
-    return MachinePiece(0, plate, 0.5), MachineStep(
-        np.eye(4)[None], np.array([speed]), np.zeros(1), arrays, np.zeros((0, 18))
-    )
+    response = np.ascontiguousarray(jacobian.transpose(0, 2, 1) / mass)
+    step = make_machine_step(np.eye(4)[None], np.array([speed]), jacobian, response)
+    return MachinePiece(0, plate, 0.5), step
 
 
 def test_sweeps_around_the_machine_bring_its_momentum_through_light_rocks():
