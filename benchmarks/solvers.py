@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from rocks import TIME_STEP, clear_way, make_dig, run_dig
 
 from drakerock.dynamics.config import NonsmoothConfig
-from drakerock.dynamics.nonsmooth import contacts, solver
+from drakerock.dynamics.nonsmooth import contacts, resting, solver
+from drakerock.dynamics.nonsmooth.batches import make_batch_arrays
 from drakerock.dynamics.nonsmooth.compiling import kernel
 
 Array = NDArray[Any]
@@ -51,7 +52,7 @@ class Problem(NamedTuple):
 def find_problems(n_piles: int, every: int) -> list[Problem]:
     """Return every so many steps' problem of digs, one in each pile, as far as the machine touches rocks."""
     problems: list[Problem] = []
-    usual, count = solver.solve_resting, 0
+    usual, count = resting.solve_resting, 0
 
     def keep(
         rows: Array, n: int, a: Array, b: Array, awake: Array, bodies: Array, n_rocks: int, *rest: Any
@@ -67,11 +68,11 @@ def find_problems(n_piles: int, every: int) -> list[Problem]:
     for pile_seed in range(n_piles):
         pile = clear_way(make_small_pile(n, site, height, pile_seed))
         depth, y = draw_dig(pile_seed, site)
-        solver.solve_resting = keep
+        resting.solve_resting = keep
         try:
             run_dig(pile, make_dig(depth), NonsmoothConfig(reduction="none"), 12.0, TIME_STEP, site, y)
         finally:
-            solver.solve_resting = usual
+            resting.solve_resting = usual
     return problems
 
 
@@ -81,17 +82,17 @@ def sweep(
     machine: solver.MachineArrays, velocity: Array, forwards: bool,
 ) -> None:  # fmt: skip
     """One sweep in double precision; `order` of the machine's contacts."""
-    solver._solve_machine_rows(machine, velocity)
+    solver.solve_machine_rows(machine, velocity)
     if forwards:
         for k in range(n_free):
-            solver._solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]])
-        solver._solve_machine_contacts(rows, order, body_a, body_b, bodies, n_rocks, machine, velocity)
+            solver.solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]])
+        solver.solve_machine_contacts(rows, order, body_a, body_b, bodies, n_rocks, machine, velocity)
     else:
-        solver._solve_machine_contacts(
+        solver.solve_machine_contacts(
             rows, order[::-1].copy(), body_a, body_b, bodies, n_rocks, machine, velocity
         )
         for k in range(n_free - 1, -1, -1):
-            solver._solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]])
+            solver.solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]])
 
 
 def gather(problem: Problem) -> Array:
@@ -188,13 +189,12 @@ def solve_as_engine(problem: Problem, iterations: int, machine_sweeps: int) -> t
     problem = problem.copy()
     rows, body_a, body_b, awake, bodies, n_rocks, machine, velocity = problem
     scratch = (
-        np.zeros((len(rows), solver.PACKED_WIDTH), np.float32),
-        np.zeros((len(rows), 3), np.int32),
+        make_batch_arrays(len(rows)),
         np.zeros(bodies.shape, np.float32),
         np.zeros(n_rocks + 1 + len(machine.jacobian), np.int64),
     )
     start = time.process_time()
-    solver.solve_resting(
+    resting.solve_resting(
         rows, len(rows), body_a, body_b, awake, bodies, n_rocks, machine, velocity, iterations, machine_sweeps,
         *scratch,
     )  # fmt: skip
@@ -240,7 +240,10 @@ def main() -> None:
         (50, 7),
         (100, 0),
         (100, 3),
+        (100, 7),
+        (150, 3),
         (200, 0),
+        (200, 3),
         (400, 0),
     ):
         pairs = [solve_as_engine(problem, iterations, machine_sweeps) for problem in problems]

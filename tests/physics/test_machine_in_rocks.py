@@ -180,9 +180,9 @@ def test_the_solve_foresees_the_plants_motion(jammed):
         x_tip=float(pile.p_WRs[:, 0].min()) - 0.7, z_tip=0.02,
     )  # fmt: skip
     bucket = scene.plant.GetBodyByName("bucket")
-    errors = []
+    errors, pushes = [], []
     for k in range(500):
-        foreseen = scene.rocks.get_report(scene.context).machine_velocity if k >= 300 else None
+        foreseen = scene.rocks.get_report(scene.context).machine_velocity if k >= 200 else None
         scene.step()
         if foreseen is not None:
             context = scene.plant_context
@@ -194,8 +194,11 @@ def test_the_solve_foresees_the_plants_motion(jammed):
                 scene.plant.SetVelocities(other, v)
                 velocity.append(scene.plant.EvalBodySpatialVelocityInWorld(other, bucket).translational())
             errors.append(np.linalg.norm(velocity[0] - velocity[1]))
-    # Closely while it drives into the first rocks; less so in the jam, with saturated motors and sliding tyres.
-    assert np.median(errors[:20]) < 2e-3
+            pushes.append(-scene.get_bucket_force()[3])
+    # Closely while it drives among the first rocks; less so in the jam, with saturated motors and sliding tyres.
+    free = np.array(pushes) < 1.5e5
+    assert free.sum() > 20
+    assert np.median(np.array(errors)[free]) < 2e-3
     assert np.median(errors) < 0.06
     assert np.max(errors) < 0.3
 

@@ -115,7 +115,7 @@ def test_stack_carries_its_weight():
     n = 10
     pile = make_pile([[0, 0, 0.25 + 0.5 * k] for k in range(n)])
     engine = make_engine(pile, [make_box(0.8, 0.8, 0.5)])
-    arrays, report = run(engine, engine.make_arrays(pile), 2.0)
+    arrays, report = run(engine, engine.make_arrays(pile), 3.0)
     stored = engine.make_pile(arrays)
     m = engine.mass[0]
     for k in range(n):

@@ -24,9 +24,12 @@ class RestConfig(Config):
         float,
         Field(
             gt=0,
-            description="it wakes when its contact impulses' sum has changed by this multiple of its weight's",
+            description="it wakes when the sum of its contact impulses has changed by this multiple of its weight's",
         ),
-    ] = 1.0
+    ] = 0.3
+    wake_share: Annotated[
+        float, Field(ge=0, description="... and of half the sum of their sizes, the pressure on it")
+    ] = 0.1
     wake_steps: Annotated[int, Field(ge=1, description="... for this many steps on end")] = 1
     sensor_length: Annotated[
         float, Field(ge=0, le=10, description="rocks this far in front of the bucket are awake [m]")

@@ -7,6 +7,8 @@ start warm and what a resting pile's force network is kept in.
 
 from __future__ import annotations
 
+import math
+
 from drakerock.dynamics.nonsmooth.compiling import Array, kernel
 
 # Columns of a contact row. All vectors in W; impulses act on body B, and reversed on body A.
@@ -189,12 +191,18 @@ def write_memory(
 
 @kernel
 def sum_impulses(memory: Array, n_rocks: int, sums: Array) -> None:
-    """Set `sums` (n, 3) to the sum of the contact impulses on each rock [N s]."""
+    """Set `sums` (n, 4) to the sum of the contact impulses on each rock, and half the sum of their sizes [N s]."""
     sums[:] = 0.0
     for row in range(len(memory)):
         a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
+        size2 = 0.0
         for d in range(3):
-            sums[a, d] -= memory[row, MEMORY_IMPULSE + d]
+            impulse = memory[row, MEMORY_IMPULSE + d]
+            size2 += impulse * impulse
+            sums[a, d] -= impulse
+            if b < n_rocks:
+                sums[b, d] += impulse
+        half = 0.5 * math.sqrt(size2)
+        sums[a, 3] += half
         if b < n_rocks:
-            for d in range(3):
-                sums[b, d] += memory[row, MEMORY_IMPULSE + d]
+            sums[b, 3] += half

@@ -36,6 +36,8 @@ Array = NDArray[np.float64]
 
 # Within this angle of its stop a joint has a row for it [rad, m].
 STOP_MARGIN = 0.05
+# Of the linkage's closed loops, as a share of the mobility they take away.
+LOOP_COMPLIANCE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,8 +204,10 @@ class MachineView(LeafSystem):
         ]
         rows = np.vstack(points[0::2]) - np.vstack(points[1::2])
         response = inverse @ rows.T
-        # A plane linkage has rows that say nothing: the pseudo-inverse leaves them out.
-        hold = response @ np.linalg.pinv(rows @ response, rcond=1e-9, hermitian=True)
+        # A plane linkage has rows that say nothing: with a little compliance they have a solution, too.
+        mobility = rows @ response
+        mobility += LOOP_COMPLIANCE * np.trace(mobility) * np.eye(len(rows))
+        hold = np.linalg.solve(mobility, response.T).T
         return inverse - hold @ response.T, free_change - hold @ (rows @ (v + free_change))
 
     def _make_motor_rows(

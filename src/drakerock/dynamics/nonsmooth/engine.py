@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drakerock.dynamics.config import NonsmoothConfig
-from drakerock.dynamics.nonsmooth import contacts, motion, reduction, solver
+from drakerock.dynamics.nonsmooth import contacts, motion, reduction, resting, solver
+from drakerock.dynamics.nonsmooth.batches import make_batch_arrays
 from drakerock.dynamics.nonsmooth.collision import broad_phase, narrow_phase
 from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, FIXED, LOST, RESTING
 from drakerock.dynamics.nonsmooth.collision.shapes import make_convex_shapes
@@ -254,7 +255,7 @@ class NonsmoothEngine:
         self._axis_keys = np.full(places, -1, np.int64)
         self._axes = np.zeros((places, 3), np.float32)
         self._statistics = np.zeros(4, np.int64)
-        self._sums = np.zeros((n, 3))
+        self._sums = np.zeros((n, 4))
         self._cell_start = np.zeros(2, np.int64)
         self._allocate_pairs(20 * n + 256)
         self._allocate_rows(6 * n + 256)
@@ -277,8 +278,7 @@ class NonsmoothEngine:
         self._row_key = np.zeros(capacity, np.int64)
         self._row_rock = np.zeros(capacity, np.int64)
         self._impacts = np.zeros((capacity, 3))
-        self._packed = np.zeros((capacity, solver.PACKED_WIDTH), np.float32)
-        self._packed_index = np.zeros((capacity, 3), np.int32)
+        self._batches = make_batch_arrays(capacity)
 
     # ---- state in and out
 
@@ -302,11 +302,11 @@ class NonsmoothEngine:
         if pile.contacts is not None:
             memory = self._make_memory(pile.contacts)
             if self.config.reduction == "rest":
-                resting = pile.contacts.resting & ~self.fixed
-                book[resting, reduction.STATUS] = RESTING
-                sums = np.zeros((n, 3))
+                at_rest = pile.contacts.resting & ~self.fixed
+                book[at_rest, reduction.STATUS] = RESTING
+                sums = np.zeros((n, 4))
                 contacts.sum_impulses(memory, n, sums)
-                book[resting, reduction.REFERENCE : reduction.REFERENCE + 3] = sums[resting]
+                book[at_rest, reduction.REFERENCE : reduction.REFERENCE + 3] = sums[at_rest, :3]
         velocities = pile.V_WRs.copy()
         velocities[book[:, reduction.STATUS] != AWAKE] = 0.0
         # Stored unit quaternions keep their bits.
@@ -446,6 +446,7 @@ class NonsmoothEngine:
                 self._sums,
                 machine.sensors,
                 config.rest.wake_load * self.gravity * dt,
+                config.rest.wake_share,
                 config.rest.wake_steps,
             )
         else:
@@ -483,9 +484,9 @@ class NonsmoothEngine:
             solver.damp_spin(rows, n_rows, body_a, body_b, self._bodies, n, config.spin_damping * dt)
         motion.add_gravity(awake, self._bodies, np.array([0.0, 0.0, -self.gravity * dt]))
         velocity += machine.free_change
-        residual = solver.solve_resting(
+        residual = resting.solve_resting(
             rows, n_rows, body_a, body_b, awake, self._bodies, n, machine.arrays, velocity, iterations,
-            config.machine_sweeps, self._packed, self._packed_index, self._bodies_32, self._marks,
+            config.machine_sweeps, self._batches, self._bodies_32, self._marks,
         )  # fmt: skip
 
         new.quaternions[:] = arrays.quaternions
@@ -522,7 +523,10 @@ class NonsmoothEngine:
         depths = -rows[:n_rows, contacts.GAP][loaded]
         max_penetration = float(depths.max(initial=0.0))
         report = StepReport(
-            F_Bs_W=self._sum_machine_forces(n_rows, n_impacts > 0),
+            F_Bs_W=solver.sum_machine_impulses(
+                rows, n_rows, body_b, n, self.n_machine_bodies, self._impacts, n_impacts > 0
+            )
+            / dt,
             machine_velocity=velocity,
             n_awake=len(awake),
             n_contacts=n_rows,
@@ -624,25 +628,6 @@ class NonsmoothEngine:
             if n_rows <= len(self._rows):
                 return int(n_rows)
             self._allocate_rows(n_rows + n_rows // 4)
-
-    def _sum_machine_forces(self, n_rows: int, with_impacts: bool) -> Array:
-        """Return (b, 6): the rocks' mean spatial force over the step on each machine body at its origin."""
-        forces = np.zeros((self.n_machine_bodies, 6))
-        chosen = np.flatnonzero(self._body_b[:n_rows] > self.n_rocks)
-        if len(chosen) == 0:
-            return forces
-        rows = self._rows[chosen]
-        impulses = np.einsum(
-            "kc,kcd->kd",
-            rows[:, contacts.IMPULSE : contacts.IMPULSE + 3],
-            rows[:, contacts.NORMAL : contacts.NORMAL + 9].reshape(-1, 3, 3),
-        )
-        if with_impacts:
-            impulses = impulses + self._impacts[chosen]
-        torques = np.cross(rows[:, contacts.ARM_B : contacts.ARM_B + 3], impulses)
-        body = self._body_b[chosen] - self.n_rocks - 1
-        np.add.at(forces, body, np.hstack([torques, impulses]) / self.time_step)
-        return forces
 
 
 def _mark_redone(report: StepReport) -> StepReport:

@@ -49,18 +49,23 @@ def wake(
     sums: Array,
     sensors: Array,
     load: float,
+    share: float,
     steps: int,
 ) -> int:
     """Wake resting rocks.
+
+    A rock under pressure from all sides holds what a loose one on the slope would not, and its neighbours' forces are
+    never still: what wakes it is measured by that pressure, or else most of those woken do not move.
 
     Args:
         book: (n, BOOK_WIDTH) changed.
         positions: (n, 3).
         radius: (n,) bounding spheres [m].
         mass: (n,) [kg].
-        sums: (n, 3) sum of the contact impulses on each rock [N s].
+        sums: (n, 4) see `contacts.sum_impulses`.
         sensors: (k, 18) see `is_sensed`.
-        load: change of the impulse per mass above which a rock wakes [m/s].
+        load: change of the impulses' sum per mass above which a rock wakes, if it is above ... [m/s]
+        share: ... this multiple of half the sum of their sizes, too.
         steps: for how many steps on end.
 
     Returns:
@@ -73,7 +78,8 @@ def wake(
         change2 = 0.0
         for d in range(3):
             change2 += (sums[i, d] - book[i, REFERENCE + d]) ** 2
-        book[i, CHANGED_STEPS] = book[i, CHANGED_STEPS] + 1.0 if change2 > (load * mass[i]) ** 2 else 0.0
+        limit = max(load * mass[i], share * sums[i, 3])
+        book[i, CHANGED_STEPS] = book[i, CHANGED_STEPS] + 1.0 if change2 > limit * limit else 0.0
         if book[i, CHANGED_STEPS] >= steps or is_sensed(
             positions[i, 0], positions[i, 1], positions[i, 2], radius[i], sensors
         ):

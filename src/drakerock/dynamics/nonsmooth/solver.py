@@ -1,15 +1,15 @@
-"""The contact solve: projected Gauss-Seidel on velocities, with an impact stage and a resting stage.
+"""The contact solve by projected Gauss-Seidel on velocities: rows, their updates one by one, the impact stage.
 
 SPOOK stepper (docs/validation/nonsmooth.md): per contact one normal row with compliance and stabilisation,
 and a tangential 2 x 2 block projected on the friction cone. The machine enters with its own inertia, in its
 generalised velocities, together with the rows of its motors, stops and tyres, so that rocks and machine are
-solved as one system.
+solved as one system. The resting stage, where the time goes, is in `resting`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,14 +53,6 @@ MACHINE_ROW_WIDTH = 7
 
 # Below this overlap the contact stiffness is constant [m].
 MIN_OVERLAP = 1e-5
-
-# Rows in single precision: the first columns as in `contacts`, up to the impulses, then the tangential step.
-PACKED_TANGENT_STEP = 27
-PACKED_WIDTH = 28
-STREAMS = 4
-
-# Contacts of rocks that are at most this many rocks away from one that touches the machine are its neighbourhood.
-NEIGHBOURHOOD = 2
 
 
 class MachineArrays(NamedTuple):
@@ -318,7 +310,7 @@ def damp_spin(
 
 
 @kernel
-def _solve_row(row: Array, dx: float, dy: float, dz: float) -> tuple[float, float, float, float]:
+def solve_row(row: Array, dx: float, dy: float, dz: float) -> tuple[float, float, float, float]:
     """Update a row's impulses for the relative velocity d; return the impulse's change in W and its normal part."""
     nx, ny, nz = row[NORMAL], row[NORMAL + 1], row[NORMAL + 2]
     old = row[IMPULSE]
@@ -358,10 +350,10 @@ def _solve_row(row: Array, dx: float, dy: float, dz: float) -> tuple[float, floa
 
 
 @kernel
-def _solve_contact(row: Array, body_a: Array, body_b: Array) -> float:
+def solve_contact(row: Array, body_a: Array, body_b: Array) -> float:
     """Update one contact and its two rocks' velocities; return the change of its normal impulse."""
     dx, dy, dz = _relative_velocity(row, body_a, body_b)
-    px, py, pz, change = _solve_row(row, dx, dy, dz)
+    px, py, pz, change = solve_row(row, dx, dy, dz)
     if px != 0.0 or py != 0.0 or pz != 0.0:
         _push(body_a, row[ARM_A], row[ARM_A + 1], row[ARM_A + 2], px, py, pz, -1.0)
         _push(body_b, row[ARM_B], row[ARM_B + 1], row[ARM_B + 2], px, py, pz, 1.0)
@@ -369,89 +361,7 @@ def _solve_contact(row: Array, body_a: Array, body_b: Array) -> float:
 
 
 @kernel
-def _solve_packed(rows: Array, k: int, bodies: Array, a: int, b: int) -> float:
-    """The same as `_solve_contact` in single precision, written out: this is where the time goes.
-
-    It takes arrays and indices: views of rows would be counted as references, which costs more than the rest.
-    """
-    zero: Any = np.float32(0.0)
-    nx, ny, nz = rows[k, NORMAL], rows[k, NORMAL + 1], rows[k, NORMAL + 2]
-    ax, ay, az = rows[k, ARM_A], rows[k, ARM_A + 1], rows[k, ARM_A + 2]
-    bx, by, bz = rows[k, ARM_B], rows[k, ARM_B + 1], rows[k, ARM_B + 2]
-    w0, w1, w2, v0, v1, v2 = (
-        bodies[a, 0],
-        bodies[a, 1],
-        bodies[a, 2],
-        bodies[a, 3],
-        bodies[a, 4],
-        bodies[a, 5],
-    )
-    s0, s1, s2, u0, u1, u2 = (
-        bodies[b, 0],
-        bodies[b, 1],
-        bodies[b, 2],
-        bodies[b, 3],
-        bodies[b, 4],
-        bodies[b, 5],
-    )
-    dx = (u0 - v0) + (s1 * bz - s2 * by) + (w2 * ay - w1 * az)
-    dy = (u1 - v1) + (s2 * bx - s0 * bz) + (w0 * az - w2 * ax)
-    dz = (u2 - v2) + (s0 * by - s1 * bx) + (w1 * ax - w0 * ay)
-    old = rows[k, IMPULSE]
-    new = (
-        old - (nx * dx + ny * dy + nz * dz + rows[k, COMPLIANCE] * old - rows[k, BIAS]) * rows[k, NORMAL_MASS]
-    )
-    if new <= zero:
-        if old == zero:
-            return zero
-        new = zero
-    change = new - old
-    rows[k, IMPULSE] = new
-    tx, ty, tz = rows[k, TANGENT_1], rows[k, TANGENT_1 + 1], rows[k, TANGENT_1 + 2]
-    qx, qy, qz = rows[k, TANGENT_2], rows[k, TANGENT_2 + 1], rows[k, TANGENT_2 + 2]
-    slip_1 = tx * dx + ty * dy + tz * dz + rows[k, COUPLING_1] * change
-    slip_2 = qx * dx + qy * dy + qz * dz + rows[k, COUPLING_2] * change
-    old_1, old_2 = rows[k, IMPULSE + 1], rows[k, IMPULSE + 2]
-    new_1 = old_1 - (rows[k, TANGENT_MASS] * slip_1 + rows[k, TANGENT_MASS + 1] * slip_2)
-    new_2 = old_2 - (rows[k, TANGENT_MASS + 1] * slip_1 + rows[k, TANGENT_MASS + 2] * slip_2)
-    limit = rows[k, FRICTION] * new
-    size2 = new_1 * new_1 + new_2 * new_2
-    if size2 > limit * limit:
-        # see _solve_row
-        new_1 = old_1 - rows[k, PACKED_TANGENT_STEP] * slip_1
-        new_2 = old_2 - rows[k, PACKED_TANGENT_STEP] * slip_2
-        size2 = new_1 * new_1 + new_2 * new_2
-        if size2 > limit * limit:
-            factor = limit / np.sqrt(size2)
-            new_1 *= factor
-            new_2 *= factor
-    rows[k, IMPULSE + 1], rows[k, IMPULSE + 2] = new_1, new_2
-    new_1 -= old_1
-    new_2 -= old_2
-    px = nx * change + tx * new_1 + qx * new_2
-    py = ny * change + ty * new_1 + qy * new_2
-    pz = nz * change + tz * new_1 + qz * new_2
-    lx, ly, lz = ay * pz - az * py, az * px - ax * pz, ax * py - ay * px
-    mass = bodies[a, INVERSE_MASS]
-    bodies[a, 0] = w0 - (bodies[a, 7] * lx + bodies[a, 8] * ly + bodies[a, 9] * lz)
-    bodies[a, 1] = w1 - (bodies[a, 8] * lx + bodies[a, 10] * ly + bodies[a, 11] * lz)
-    bodies[a, 2] = w2 - (bodies[a, 9] * lx + bodies[a, 11] * ly + bodies[a, 12] * lz)
-    bodies[a, 3] = v0 - mass * px
-    bodies[a, 4] = v1 - mass * py
-    bodies[a, 5] = v2 - mass * pz
-    lx, ly, lz = by * pz - bz * py, bz * px - bx * pz, bx * py - by * px
-    mass = bodies[b, INVERSE_MASS]
-    bodies[b, 0] = s0 + (bodies[b, 7] * lx + bodies[b, 8] * ly + bodies[b, 9] * lz)
-    bodies[b, 1] = s1 + (bodies[b, 8] * lx + bodies[b, 10] * ly + bodies[b, 11] * lz)
-    bodies[b, 2] = s2 + (bodies[b, 9] * lx + bodies[b, 11] * ly + bodies[b, 12] * lz)
-    bodies[b, 3] = u0 + mass * px
-    bodies[b, 4] = u1 + mass * py
-    bodies[b, 5] = u2 + mass * pz
-    return change
-
-
-@kernel
-def _solve_machine_contacts(
+def solve_machine_contacts(
     rows: Array,
     order: Array,
     body_a: Array,
@@ -480,7 +390,7 @@ def _solve_machine_contacts(
             _calc_body_velocity(machine, velocity, current, spatial)
         one = bodies[body_a[k]]
         dx, dy, dz = _relative_velocity_machine(row, one, spatial)
-        px, py, pz, change = _solve_row(row, dx, dy, dz)
+        px, py, pz, change = solve_row(row, dx, dy, dz)
         changed += abs(change)
         if px != 0.0 or py != 0.0 or pz != 0.0:
             _push(one, row[ARM_A], row[ARM_A + 1], row[ARM_A + 2], px, py, pz, -1.0)
@@ -495,15 +405,6 @@ def _solve_machine_contacts(
     if current >= 0:
         _push_machine(machine, velocity, current, impulse)
     return changed
-
-
-@kernel
-def _find_machine_rows(n_rows: int, body_b: Array, n_rocks: int) -> int:
-    """Return the first of the machine's contacts; they are the last rows."""
-    first = n_rows
-    while first > 0 and body_b[first - 1] > n_rocks:
-        first -= 1
-    return first
 
 
 @kernel
@@ -528,7 +429,7 @@ def _set_row_impulse(machine: MachineArrays, velocity: Array, k: int, impulse: f
 
 
 @kernel
-def _solve_machine_rows(machine: MachineArrays, velocity: Array) -> None:
+def solve_machine_rows(machine: MachineArrays, velocity: Array) -> None:
     """Sweep over the machine's own rows: motors, stops, tyres. A normal row is followed by its two of friction."""
     values = machine.row_values
     k = 0
@@ -591,149 +492,39 @@ def _calc_impulse(row: Array) -> Vector:
 
 
 @kernel
-def _pack(rows: Array, n_rows: int, body_a: Array, body_b: Array, packed: Array, index: Array) -> None:
-    """Copy rows to single precision, in `STREAMS` interleaved streams.
-
-    Neighbours in the order then seldom share a body, and the processor works on several at a time. `index` is set
-    to (rows, 3): body A, body B, original row.
-    """
-    length = (n_rows + STREAMS - 1) // STREAMS
-    place = 0
-    for k in range(length):
-        for stream in range(STREAMS):
-            source = stream * length + k
-            if source < min(n_rows, (stream + 1) * length):
-                for d in range(IMPULSE + 3):
-                    packed[place, d] = rows[source, d]
-                packed[place, PACKED_TANGENT_STEP] = rows[source, TANGENT_STEP]
-                index[place, 0], index[place, 1], index[place, 2] = body_a[source], body_b[source], source
-                place += 1
-
-
-@kernel
-def _find_neighbourhood(
-    n_free: int, n_rows: int, body_a: Array, index: Array, n_rocks: int, marks: Array
-) -> Array:
-    """Return the packed rows in the machine's neighbourhood, in their order.
-
-    Args:
-        n_free, n_rows, body_a: the rocks' rows are the first, the machine's the others.
-        index: of the packed rows.
-        n_rocks: see `prepare_rows`.
-        marks: (bodies of the solve,) scratch.
-    """
-    marks[:] = 0
-    for k in range(n_free, n_rows):
-        marks[body_a[k]] = 1
-    for distance in range(1, NEIGHBOURHOOD + 1):
-        for k in range(n_free):
-            a, b = index[k, 0], index[k, 1]
-            if b == n_rocks:
-                continue
-            if marks[a] == distance and marks[b] == 0:
-                marks[b] = distance + 1
-            elif marks[b] == distance and marks[a] == 0:
-                marks[a] = distance + 1
-    near = np.empty(n_free, np.int64)
-    n_near = 0
-    for k in range(n_free):
-        if marks[index[k, 0]] > 0 or marks[index[k, 1]] > 0:
-            near[n_near] = k
-            n_near += 1
-    return near[:n_near]
-
-
-@kernel
-def solve_resting(
+def sum_machine_impulses(
     rows: Array,
     n_rows: int,
-    body_a: Array,
     body_b: Array,
-    awake: Array,
-    bodies: Array,
     n_rocks: int,
-    machine: MachineArrays,
-    velocity: Array,
-    iterations: int,
-    machine_sweeps: int,
-    packed: Array,
-    index: Array,
-    bodies_32: Array,
-    marks: Array,
-) -> float:
-    """The resting stage: `iterations` symmetric sweeps, forwards and backwards in turn.
-
-    Each is followed by `machine_sweeps` over the machine's own rows, its contacts and their neighbourhood. A light rock
-    that the machine presses on others passes on little of the machine's momentum per sweep.
-
-    The sweeps over the rocks run in single precision; the velocities are then made anew from the impulses in
-    double precision, so that momentum is kept to rounding.
+    n_bodies: int,
+    impact_impulses: Array,
+    with_impacts: bool,
+) -> Array:
+    """Return (n_bodies, 6): the rocks' spatial impulse on each machine body at its origin, in W.
 
     Args:
-        rows, n_rows, body_a, body_b: prepared contact rows with the warm start's impulses; the machine's are the
-            last. Impulses are set.
-        awake: (m,) rocks that can move.
-        bodies, machine, velocity: with gravity and free velocities, without the warm start; changed.
-        n_rocks: see `prepare_rows`.
-        iterations: number of sweeps over all contacts.
-        machine_sweeps: further sweeps about the machine after each.
-        packed, index, bodies_32: (rows, PACKED_WIDTH) and (n_rocks + 1, BODY_WIDTH) float32, (rows, 3) int32
-            scratch; `bodies_32` has to be zero and is left so.
-        marks: (bodies of the solve,) scratch.
-
-    Returns:
-        the residual: the last whole sweep's change of the normal impulses over their sum.
+        rows, n_rows, body_b, n_rocks: after the solve, see `prepare_rows`.
+        n_bodies: of the machine that touch rocks.
+        impact_impulses, with_impacts: (rows, 3) of the impact stage, if there was one.
     """
-    free = np.empty((len(awake), 6))
-    for s in range(len(awake)):
-        for d in range(6):
-            free[s, d] = bodies[awake[s], d]
-    apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity)
-    for s in range(len(awake)):
-        for d in range(INVERSE_INERTIA + 6):
-            bodies_32[awake[s], d] = bodies[awake[s], d]
-    n_free = _find_machine_rows(n_rows, body_b, n_rocks)
-    forwards = np.arange(n_free, n_rows)
-    backwards = forwards[::-1].copy()
-    _pack(rows, n_free, body_a, body_b, packed, index)
-    everywhere = np.arange(n_free)
-    nearby = _find_neighbourhood(n_free, n_rows, body_a, index, n_rocks, marks)
-    changed = 0.0
-    for iteration in range(iterations):
-        for sweep in range(1 + machine_sweeps):
-            order = everywhere if sweep == 0 else nearby
-            if len(machine.row_values) > 0:
-                _solve_machine_rows(machine, velocity)
-            change = 0.0
-            if (iteration + sweep) % 2 == 0:
-                for c in range(len(order)):
-                    k = order[c]
-                    change += abs(_solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1]))
-                change += _solve_machine_contacts(
-                    rows, forwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
-                )
-            else:
-                change += _solve_machine_contacts(
-                    rows, backwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
-                )
-                for c in range(len(order) - 1, -1, -1):
-                    k = order[c]
-                    change += abs(_solve_packed(packed, k, bodies_32, index[k, 0], index[k, 1]))
-            if sweep == 0:
-                changed = change
-    for k in range(n_free):
-        for d in range(3):
-            rows[index[k, 2], IMPULSE + d] = packed[k, IMPULSE + d]
-    for s in range(len(awake)):
-        for d in range(6):
-            bodies[awake[s], d] = free[s, d]
-        # What is not awake stays zero: at rest, and immovable.
-        bodies_32[awake[s]] = 0.0
-    apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, np.zeros(len(velocity)))
-    total = 0.0
+    sums = np.zeros((n_bodies, 6))
     for k in range(n_rows):
-        total += rows[k, IMPULSE]
-    return changed / total if total > 0.0 else 0.0
+        number = body_b[k] - n_rocks - 1
+        if number < 0:
+            continue
+        row = rows[k]
+        px, py, pz = _calc_impulse(row)
+        if with_impacts:
+            px, py, pz = px + impact_impulses[k, 0], py + impact_impulses[k, 1], pz + impact_impulses[k, 2]
+        rx, ry, rz = row[ARM_B], row[ARM_B + 1], row[ARM_B + 2]
+        sums[number, 0] += ry * pz - rz * py
+        sums[number, 1] += rz * px - rx * pz
+        sums[number, 2] += rx * py - ry * px
+        sums[number, 3] += px
+        sums[number, 4] += py
+        sums[number, 5] += pz
+    return sums
 
 
 @kernel
@@ -822,8 +613,8 @@ def solve_impacts(
     for _ in range(iterations):
         for c in range(n_free):
             k = chosen[c]
-            _solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]])
-        _solve_machine_contacts(
+            solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]])
+        solve_machine_contacts(
             rows, chosen[n_free:n_chosen], body_a, body_b, bodies, n_rocks, machine, velocity
         )
     for c in range(n_chosen):

@@ -1,0 +1,165 @@
+"""The contact solve's resting stage: sweeps over all contacts, and further ones about the machine."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drakerock.dynamics.nonsmooth.batches import (
+    BatchArrays,
+    make_batches,
+    pack,
+    solve_batch,
+    unpack_impulses,
+)
+from drakerock.dynamics.nonsmooth.compiling import Array, kernel
+from drakerock.dynamics.nonsmooth.contacts import IMPULSE
+from drakerock.dynamics.nonsmooth.solver import (
+    INVERSE_INERTIA,
+    MachineArrays,
+    apply_impulses,
+    solve_machine_contacts,
+    solve_machine_rows,
+)
+
+# Contacts of rocks that are at most this many rocks away from one that touches the machine are its neighbourhood.
+NEIGHBOURHOOD = 2
+
+
+@kernel
+def _find_machine_rows(n_rows: int, body_b: Array, n_rocks: int) -> int:
+    """Return the first of the machine's contacts; they are the last rows."""
+    first = n_rows
+    while first > 0 and body_b[first - 1] > n_rocks:
+        first -= 1
+    return first
+
+
+@kernel
+def _mark_neighbourhood(
+    n_free: int, n_rows: int, body_a: Array, body_b: Array, n_rocks: int, marks: Array
+) -> None:
+    """Mark the rocks in the machine's neighbourhood with 1 and more.
+
+    Args:
+        n_free, n_rows, body_a, body_b: the rocks' rows are the first, the machine's the others.
+        n_rocks: see `prepare_rows`.
+        marks: (bodies of the solve,) set.
+    """
+    marks[:] = 0
+    for k in range(n_free, n_rows):
+        marks[body_a[k]] = 1
+    for distance in range(1, NEIGHBOURHOOD + 1):
+        for k in range(n_free):
+            a, b = body_a[k], body_b[k]
+            if b == n_rocks:
+                continue
+            if marks[a] == distance and marks[b] == 0:
+                marks[b] = distance + 1
+            elif marks[b] == distance and marks[a] == 0:
+                marks[a] = distance + 1
+
+
+@kernel
+def _make_all_batches(
+    n_free: int, n_rows: int, body_a: Array, body_b: Array, n_rocks: int, marks: Array, members: Array
+) -> tuple[int, int]:
+    """Put the rocks' rows into batches, the machine's neighbourhood first; return how many it has, and all."""
+    _mark_neighbourhood(n_free, n_rows, body_a, body_b, n_rocks, marks)
+    near, far = np.empty(n_free, np.int64), np.empty(n_free, np.int64)
+    n_near = 0
+    for k in range(n_free):
+        if marks[body_a[k]] > 0 or marks[body_b[k]] > 0:
+            near[n_near] = k
+            n_near += 1
+        else:
+            far[k - n_near] = k
+    marks[:] = 0
+    n_batches = make_batches(near[:n_near], body_a, body_b, n_rocks, marks, members, 0)
+    return n_batches, make_batches(far[: n_free - n_near], body_a, body_b, n_rocks, marks, members, n_batches)
+
+
+@kernel
+def solve_resting(
+    rows: Array,
+    n_rows: int,
+    body_a: Array,
+    body_b: Array,
+    awake: Array,
+    bodies: Array,
+    n_rocks: int,
+    machine: MachineArrays,
+    velocity: Array,
+    iterations: int,
+    machine_sweeps: int,
+    batches: BatchArrays,
+    bodies_32: Array,
+    marks: Array,
+) -> float:
+    """The resting stage: `iterations` symmetric sweeps, forwards and backwards in turn.
+
+    Each is followed by `machine_sweeps` over the machine's own rows, its contacts and their neighbourhood. A light rock
+    that the machine presses on others passes on little of the machine's momentum per sweep.
+
+    The sweeps over the rocks run in single precision; the velocities are then made anew from the impulses in
+    double precision, so that momentum is kept to rounding.
+
+    Args:
+        rows, n_rows, body_a, body_b: prepared contact rows with the warm start's impulses; the machine's are the
+            last. Impulses are set.
+        awake: (m,) rocks that can move.
+        bodies, machine, velocity: with gravity and free velocities, without the warm start; changed.
+        n_rocks: see `prepare_rows`.
+        iterations: number of sweeps over all contacts.
+        machine_sweeps: further sweeps about the machine after each.
+        batches: room for as many rows.
+        bodies_32: (n_rocks + 1, BODY_WIDTH) float32 scratch; has to be zero and is left so.
+        marks: (bodies of the solve,) scratch.
+
+    Returns:
+        the residual: the last whole sweep's change of the normal impulses over their sum.
+    """
+    free = np.empty((len(awake), 6))
+    for s in range(len(awake)):
+        for d in range(6):
+            free[s, d] = bodies[awake[s], d]
+    apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, velocity)
+    for s in range(len(awake)):
+        for d in range(INVERSE_INERTIA + 6):
+            bodies_32[awake[s], d] = bodies[awake[s], d]
+    n_free = _find_machine_rows(n_rows, body_b, n_rocks)
+    forwards = np.arange(n_free, n_rows)
+    backwards = forwards[::-1].copy()
+    n_near, n_batches = _make_all_batches(n_free, n_rows, body_a, body_b, n_rocks, marks, batches.members)
+    pack(rows, body_a, body_b, n_rocks, batches, n_batches)
+    changed = 0.0
+    for iteration in range(iterations):
+        for sweep in range(1 + machine_sweeps):
+            n = n_batches if sweep == 0 else n_near
+            if len(machine.row_values) > 0:
+                solve_machine_rows(machine, velocity)
+            batches.changes[:] = 0.0
+            if (iteration + sweep) % 2 == 0:
+                for k in range(n):
+                    solve_batch(batches, k, bodies_32)
+                change = solve_machine_contacts(
+                    rows, forwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
+                )
+            else:
+                change = solve_machine_contacts(
+                    rows, backwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
+                )
+                for k in range(n - 1, -1, -1):
+                    solve_batch(batches, k, bodies_32)
+            if sweep == 0:
+                changed = change + float(batches.changes.sum())
+    unpack_impulses(batches, n_batches, rows)
+    for s in range(len(awake)):
+        for d in range(6):
+            bodies[awake[s], d] = free[s, d]
+        # What is not awake stays zero: at rest, and immovable.
+        bodies_32[awake[s]] = 0.0
+    apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, np.zeros(len(velocity)))
+    total = 0.0
+    for k in range(n_rows):
+        total += rows[k, IMPULSE]
+    return changed / total if total > 0.0 else 0.0
