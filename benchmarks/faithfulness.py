@@ -3,6 +3,7 @@
     nice python benchmarks/faithfulness.py run 300 --seeds 40 --out build/faithfulness
     nice python benchmarks/faithfulness.py cycles 300 --seeds 40 --out build/faithfulness
     nice python benchmarks/faithfulness.py states 300 --seeds 8 --out build/faithfulness
+    nice python benchmarks/faithfulness.py held full --seeds 3 --variants rest wake-1 --out build/faithfulness
     python benchmarks/faithfulness.py table --out build/faithfulness
 
 `run` digs by fixed motor rates; `cycles` plans and drives whole loading cycles of random strategies, which gives
@@ -13,6 +14,10 @@ awake) relative to its mean, with its 90 % confidence interval.
 `states` stops a dig every 0.6 s, and each variant goes on from there for 0.2 s. That is too short for chaos, so small
 differences show; what it leaves out is that variants come to different states.
 
+`held` stops a dig with reduction every 3 s, and goes on from there for 2 s by its own rule and with all rocks awake:
+how much more is displaced then is what the rule had held back. That tells rules apart with a tenth of the digs that
+`run` wants.
+
 Runs that are stored already are skipped, so a study can be stopped and continued.
 """
 
@@ -22,6 +27,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
@@ -70,8 +76,18 @@ VARIANTS: dict[str, tuple[dict[str, object], float]] = {
     "rest-slow": ({"reduction": "rest", "rest": {"displacement": 0.004, "time": 0.3}}, TIME_STEP),
     "rest-0.2": ({"reduction": "rest", "rest": {"time": 0.2}}, TIME_STEP),
     "sensor-4": ({"reduction": "rest", "rest": {"sensor_length": 4.0, "sensor_margin": 0.8}}, TIME_STEP),
-    "alpha-0.5": ({"reduction": "rest", "rest": {"wake_load": 0.5}}, TIME_STEP),
-    "alpha-2": ({"reduction": "rest", "rest": {"wake_load": 2.0}}, TIME_STEP),
+    "wake-1": ({"reduction": "rest", "rest": {"wake_load": 1.0, "wake_share": 0.0}}, TIME_STEP),
+    "wake-0.5": ({"reduction": "rest", "rest": {"wake_load": 0.5, "wake_share": 0.0}}, TIME_STEP),
+    "wake-0.5-quick": (
+        {
+            "reduction": "rest",
+            "rest": {"wake_load": 0.5, "wake_share": 0.0, "time": 0.03, "displacement": 3e-4},
+        },
+        TIME_STEP,
+    ),
+    "share-0.2": ({"reduction": "rest", "rest": {"wake_share": 0.2}}, TIME_STEP),
+    "share-0.05": ({"reduction": "rest", "rest": {"wake_share": 0.05}}, TIME_STEP),
+    "rest-0.05": ({"reduction": "rest", "rest": {"time": 0.05, "displacement": 5e-4}}, TIME_STEP),
     "no-machine-sweeps": ({"reduction": "none", "machine_sweeps": 0}, TIME_STEP),
     "iterations-400": ({"reduction": "none", "iterations": 400}, TIME_STEP),
     "converged": ({"reduction": "none", "iterations": 2000}, TIME_STEP),
@@ -92,6 +108,9 @@ CYCLE_METRICS = (
 STATE_METRICS = ("push_kN", "peak_push_kN", "tip_mm", "cpu_s")
 # Of `states`: time between states, and how long each variant goes on [s]. States without push say nothing [kN].
 STATE_PERIOD, STATE_TIME, MIN_PUSH = 0.6, 0.2, 20.0
+# Of `held`: when digs are stopped, and how long they go on [s]; what moved farther than this has moved [m].
+HELD_TIMES, HELD_TIME, HELD_DISTANCES = (3.0, 6.0, 9.0), 2.0, (0.02, 0.05, 0.2)
+HELD_METRICS = ("rule_m3", "none_m3", "awake", "cpu_s")
 METRICS = ("bucket_mass_kg", "peak_push_kN", "mean_push_kN", "displaced_m3", "reach_m", "cpu_s")
 
 
@@ -220,18 +239,57 @@ def run_states(size: str, seeds: range, variants: list[str], out: Path) -> None:
             store(path, seed, name, values, STATE_METRICS)
 
 
-def continue_dig(
-    simulator: Simulator, plant: MultibodyPlant, rocks: NonsmoothRocks, settings: NonsmoothConfig
-) -> dict[str, float]:
-    """Go on for `STATE_TIME` from a copy of the simulator's context with other settings."""
+def run_held(size: str, seeds: range, variants: list[str], out: Path) -> None:
+    """What each variant holds back that moves when all rocks are woken."""
+    site, path = SIZES[size][1], out / f"{size}-held.jsonl"
+    none = NonsmoothConfig(reduction="none")
+    for seed, name in list_work(seeds, variants, path):
+        pile, (depth, y) = clear_way(start_at_rest(size, seed, "rest")), draw_dig(seed, site)
+        settings = NonsmoothConfig(**VARIANTS[name][0])
+        simulator, _, _, rocks = build_dig(pile, make_dig(depth), settings, TIME_STEP, site, y)
+        root = simulator.get_mutable_context()
+        found: dict[str, list[float]] = {metric: [] for metric in HELD_METRICS}
+        cpu = 0.0
+        for t in HELD_TIMES:
+            cpu -= time.process_time()
+            while root.get_time() < t - 1e-9:
+                simulator.AdvanceTo(root.get_time() + 0.1)
+                found["awake"].append(float(rocks.get_report(root).n_awake))
+            cpu += time.process_time()
+            for metric, config in (("rule_m3", settings), ("none_m3", none)):
+                with go_on_with(simulator, rocks, config) as other:
+                    other.AdvanceTo(t + HELD_TIME)
+                    after = rocks.get_pile(other.get_context())
+                moved = np.linalg.norm(after.p_WRs - pile.p_WRs, axis=1)
+                found[metric] += [
+                    float(rocks.engine.mass[moved > distance].sum() / ROCKS.density)
+                    for distance in HELD_DISTANCES
+                ]
+        found["cpu_s"].append(cpu)
+        store(path, seed, name, found, HELD_METRICS)
+
+
+@contextmanager
+def go_on_with(simulator: Simulator, rocks: NonsmoothRocks, settings: NonsmoothConfig) -> Iterator[Simulator]:
+    """Give a simulator that goes on from a copy of another's context, the rocks with other settings meanwhile."""
     usual = rocks.engine.config
     rocks.engine.config = settings
     try:
         other = Simulator(simulator.get_system(), simulator.get_context().Clone())
-        root = other.get_mutable_context()
-        context = rocks.GetMyMutableContextFromRoot(root)
         # The step's solution is to be found anew.
-        context.get_mutable_discrete_state()
+        rocks.GetMyMutableContextFromRoot(other.get_mutable_context()).get_mutable_discrete_state()
+        yield other
+    finally:
+        rocks.engine.config = usual
+
+
+def continue_dig(
+    simulator: Simulator, plant: MultibodyPlant, rocks: NonsmoothRocks, settings: NonsmoothConfig
+) -> dict[str, float]:
+    """Go on for `STATE_TIME` from a copy of the simulator's context with other settings."""
+    with go_on_with(simulator, rocks, settings) as other:
+        root = other.get_mutable_context()
+        context = rocks.GetMyContextFromRoot(root)
         tip = plant.GetFrameByName("tip")
         plant_context = plant.GetMyContextFromRoot(root)
         forces, start, cpu = [], root.get_time(), time.process_time()
@@ -244,8 +302,6 @@ def continue_dig(
             "tip_mm": float(tip.CalcPoseInWorld(plant_context).translation()[0]) * 1e3,
             "cpu_s": time.process_time() - cpu,
         }
-    finally:
-        rocks.engine.config = usual
 
 
 def read(path: Path) -> list[dict]:
@@ -306,10 +362,36 @@ def print_states(out: Path, baselines: Sequence[str] = ("none", "converged")) ->
             print(f"| {size} | {variant} | {baseline} | {pushed.sum()} | " + " | ".join(cells) + " |")
 
 
+def print_held(out: Path) -> None:
+    """Print what rules hold back: displaced volume against that when all are woken, with its 90 % interval."""
+    titles = [f"displaced by more than {100 * distance:g} cm" for distance in HELD_DISTANCES]
+    print("| rocks | variant | states | " + " | ".join(titles) + " | awake | CPU s to 9 s |")
+    print("|---|---|---|" + "---|" * (len(titles) + 2))
+    for size in SIZES:
+        results = read(out / f"{size}-held.jsonl")
+        for variant in VARIANTS:
+            chosen = [r for r in results if r["variant"] == variant]
+            if not chosen:
+                continue
+            rule, none = (
+                np.concatenate([np.reshape(r[metric], (-1, len(HELD_DISTANCES))) for r in chosen])
+                for metric in ("rule_m3", "none_m3")
+            )
+            cells = []
+            for a, b in zip(rule.T, none.T, strict=True):
+                mean, half = compare(a, b)
+                cells.append(f"{100 * mean / b.mean():+.1f} ± {100 * half / b.mean():.1f} %")
+            awake, cpu = (np.mean([np.mean(r[metric]) for r in chosen]) for metric in ("awake", "cpu_s"))
+            print(
+                f"| {size} | {variant} | {len(rule)} | " + " | ".join(cells) + f" | {awake:.0f} | {cpu:.1f} |"
+            )
+    print()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    for name in ("run", "cycles", "states"):
+    for name in ("run", "cycles", "states", "held"):
         one = commands.add_parser(name)
         one.add_argument("size", choices=SIZES)
         one.add_argument("--seeds", type=int, default=40)
@@ -322,9 +404,10 @@ def main() -> None:
     if arguments.command == "table":
         print_table(arguments.out)
         print_states(arguments.out)
+        print_held(arguments.out)
     else:
         seeds = range(arguments.first, arguments.first + arguments.seeds)
-        work = {"run": run, "cycles": run_cycles, "states": run_states}[arguments.command]
+        work = {"run": run, "cycles": run_cycles, "states": run_states, "held": run_held}[arguments.command]
         work(arguments.size, seeds, arguments.variants, arguments.out)
 
 

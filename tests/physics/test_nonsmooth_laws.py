@@ -145,6 +145,20 @@ def test_tall_tower_stands():
     assert report.max_penetration == pytest.approx(sinking.max(), rel=0.2)
 
 
+def test_linear_contacts_sink_in_proportion_to_the_load():
+    """One cube and two on the floor, with Hertz's force at 1 mm: the overlap doubles with the load."""
+    modulus, overlaps = 0.5 * 1e9 / (1 - 0.3**2), []
+    for n in (1, 2):
+        pile = make_pile([[0, 0, 0.5 + k] for k in range(n)])
+        config = NonsmoothConfig(linear_overlap=1e-3, reduction="none", rounding=0.01)
+        engine = make_engine(pile, [make_box(1.0, 1.0, 1.0)], config=config)
+        arrays, _ = run(engine, engine.make_arrays(pile), 3.0)
+        stiffness = 4 / 3 * modulus * np.sqrt(1.0 * 1e-3)
+        overlaps.append(0.5 - arrays.positions[0, 2])
+        assert overlaps[-1] == pytest.approx(n * engine.mass[0] * G / 4 / stiffness, rel=0.02)
+    assert overlaps[1] == pytest.approx(2 * overlaps[0], rel=0.02)
+
+
 def test_arch_of_blocks_stands_and_thrusts():
     """A semicircular arch of nine voussoirs stands by friction and geometry alone."""
     n, inner, outer, width = 9, 2.0, 3.0, 1.0

@@ -60,6 +60,13 @@ class NonsmoothConfig(Config):
             description="on Hertz's stiffness of balls whose radii are the sieve widths, by modulus and Poisson ratio",
         ),
     ] = 1.0
+    linear_overlap: Annotated[
+        float,
+        Field(
+            ge=0,
+            description="0: Hertz's law; above: linear, with Hertz's force at this overlap, as in the plant engine [m]",
+        ),
+    ] = 0.0
     spin_damping: Annotated[
         float, Field(ge=0, le=20, description="each loaded contact damps the pair's relative spin [1/s]")
     ] = 2.0

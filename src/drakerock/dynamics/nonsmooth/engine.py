@@ -472,7 +472,7 @@ class NonsmoothEngine:
         upsilon = 1.0 / (1.0 + 4.0 * config.damping_time)
         solver.prepare_rows(
             rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, self.curvature, self.hertz,
-            dt, upsilon, config.max_recovery_speed, config.impact_threshold,
+            config.linear_overlap, dt, upsilon, config.max_recovery_speed, config.impact_threshold,
         )  # fmt: skip
         n_impacts = 0
         if self.restitution.any():

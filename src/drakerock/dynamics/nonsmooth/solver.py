@@ -198,6 +198,7 @@ def prepare_rows(
     velocity: Array,
     curvature: Array,
     hertz: float,
+    linear_overlap: float,
     time_step: float,
     upsilon: float,
     max_recovery_speed: float,
@@ -212,6 +213,7 @@ def prepare_rows(
         machine, velocity: the machine and its generalised velocities before the step.
         curvature: (bodies of the solve,) 1 / radius of a rock, 0 for all else [1/m].
         hertz: 4/3 E*, E* the pair's effective modulus [Pa]: force = hertz sqrt(radius) overlap^(3/2).
+        linear_overlap: if above 0, force = hertz sqrt(radius linear_overlap) overlap instead [m].
         time_step: [s]; upsilon: 1 / (1 + 4 tau / dt).
         max_recovery_speed: at which overlaps are pushed apart at most [m/s].
         impact_threshold: what approaches faster is an impact [m/s].
@@ -246,13 +248,14 @@ def prepare_rows(
             # apart: they may approach until they touch at the end of the step
             bias = -gap / time_step
         else:
-            bias = min(-4.0 * upsilon * (2.0 / 3.0) * gap / time_step, max_recovery_speed)
+            # A force that grows with this power of the overlap is, about it, a spring stretched by 1 / power of it.
+            power = 1.0 if linear_overlap > 0.0 else 1.5
+            bias = min(-4.0 * upsilon * (1.0 / power) * gap / time_step, max_recovery_speed)
             approach = nx * dx + ny * dy + nz * dz
             # An impact without restitution is rigid, and none of its speed is kept.
             if approach >= -impact_threshold:
-                # Hertz's force, linear about this overlap: a spring of stiffness k stretched by 2/3 of it
-                overlap = max(-gap, MIN_OVERLAP)
-                stiffness = 1.5 * hertz * math.sqrt(overlap / (curvature[a] + curvature[b]))
+                overlap = linear_overlap if linear_overlap > 0.0 else max(-gap, MIN_OVERLAP)
+                stiffness = power * hertz * math.sqrt(overlap / (curvature[a] + curvature[b]))
                 compliance = 4.0 * upsilon / (stiffness * time_step * time_step)
                 bias += upsilon * min(approach, 0.0)
         diagonal = _quadratic(mobility, nx, ny, nz, nx, ny, nz) + compliance

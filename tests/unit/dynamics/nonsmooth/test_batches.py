@@ -33,7 +33,7 @@ def draw_rows(rng, n_rows, n_rocks):
     machine = make_machineless_step().arrays
     curvature = np.append(np.full(n_rocks, 2.0), 0.0)
     solver.prepare_rows(
-        rows, n_rows, body_a, body_b, bodies, n_rocks, machine, np.zeros(0), curvature, 7e8, 0.01, 0.05, 1.0, 10.0
+        rows, n_rows, body_a, body_b, bodies, n_rocks, machine, np.zeros(0), curvature, 7e8, 0.0, 0.01, 0.05, 1.0, 10.0
     )  # fmt: skip
     return rows, body_a, body_b, bodies
 
