@@ -191,18 +191,28 @@ def write_memory(
 
 @kernel
 def sum_impulses(memory: Array, n_rocks: int, sums: Array) -> None:
-    """Set `sums` (n, 4) to the sum of the contact impulses on each rock, and half the sum of their sizes [N s]."""
+    """Set `sums` (n, 3) to the sum of the contact impulses on each rock [N s]."""
     sums[:] = 0.0
     for row in range(len(memory)):
         a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
-        size2 = 0.0
         for d in range(3):
-            impulse = memory[row, MEMORY_IMPULSE + d]
-            size2 += impulse * impulse
-            sums[a, d] -= impulse
-            if b < n_rocks:
-                sums[b, d] += impulse
-        half = 0.5 * math.sqrt(size2)
-        sums[a, 3] += half
+            sums[a, d] -= memory[row, MEMORY_IMPULSE + d]
         if b < n_rocks:
-            sums[b, 3] += half
+            for d in range(3):
+                sums[b, d] += memory[row, MEMORY_IMPULSE + d]
+
+
+@kernel
+def sum_pressures(memory: Array, n_rocks: int, chosen: Array, pressures: Array) -> None:
+    """Set `pressures` (n,) of the rocks `chosen` (n,) to half the sum of the sizes of their contact impulses [N s]."""
+    pressures[:] = 0.0
+    for row in range(len(memory)):
+        a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
+        if chosen[a] or (b < n_rocks and chosen[b]):
+            size2 = 0.0
+            for d in range(3):
+                size2 += memory[row, MEMORY_IMPULSE + d] ** 2
+            half = 0.5 * math.sqrt(size2)
+            pressures[a] += half
+            if b < n_rocks:
+                pressures[b] += half

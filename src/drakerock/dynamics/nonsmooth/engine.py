@@ -255,7 +255,7 @@ class NonsmoothEngine:
         self._axis_keys = np.full(places, -1, np.int64)
         self._axes = np.zeros((places, 3), np.float32)
         self._statistics = np.zeros(4, np.int64)
-        self._sums = np.zeros((n, 4))
+        self._sums = np.zeros((n, 3))
         self._cell_start = np.zeros(2, np.int64)
         self._allocate_pairs(20 * n + 256)
         self._allocate_rows(6 * n + 256)
@@ -304,9 +304,9 @@ class NonsmoothEngine:
             if self.config.reduction == "rest":
                 at_rest = pile.contacts.resting & ~self.fixed
                 book[at_rest, reduction.STATUS] = RESTING
-                sums = np.zeros((n, 4))
+                sums = np.zeros((n, 3))
                 contacts.sum_impulses(memory, n, sums)
-                book[at_rest, reduction.REFERENCE : reduction.REFERENCE + 3] = sums[at_rest, :3]
+                book[at_rest, reduction.REFERENCE : reduction.REFERENCE + 3] = sums[at_rest]
         velocities = pile.V_WRs.copy()
         velocities[book[:, reduction.STATUS] != AWAKE] = 0.0
         # Stored unit quaternions keep their bits.
@@ -437,13 +437,12 @@ class NonsmoothEngine:
         book[:] = arrays.book
         n_woken = 0
         if config.reduction == "rest":
-            contacts.sum_impulses(memory, n, self._sums)
             n_woken = reduction.wake(
                 book,
                 arrays.positions,
                 self.radius,
                 self.mass,
-                self._sums,
+                memory,
                 machine.sensors,
                 config.rest.wake_load * self.gravity * dt,
                 config.rest.wake_share,

@@ -17,12 +17,13 @@ HUGE = 1e9
 @kernel
 def are_finite(values: Array) -> bool:
     """Return whether all values of a matrix are finite, and none is absurdly large."""
-    for i in range(values.shape[0]):
-        for d in range(values.shape[1]):
-            # Not math.isfinite: with sums reordered it is compiled to True.
-            if not abs(values[i, d]) < HUGE:
-                return False
-    return True
+    finite = True
+    flat = values.ravel()
+    # Without a way out on the first, which would keep the compiler from making vectors of the loop.
+    for k in range(len(flat)):
+        # Not math.isfinite: with sums reordered it is compiled to True.
+        finite &= abs(flat[k]) < HUGE
+    return finite
 
 
 @kernel

@@ -7,8 +7,11 @@ the refinement sensor in front of the bucket.
 
 from __future__ import annotations
 
+import numpy as np
+
 from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, LOST, RESTING
 from drakerock.dynamics.nonsmooth.compiling import Array, kernel
+from drakerock.dynamics.nonsmooth.contacts import sum_impulses, sum_pressures
 
 # Columns of a rock's bookkeeping (all stored in the context).
 STATUS = 0
@@ -30,12 +33,13 @@ def is_sensed(x: float, y: float, z: float, radius: float, sensors: Array) -> bo
     for s in range(len(sensors)):
         box = sensors[s]
         dx, dy, dz = x - box[9], y - box[10], z - box[11]
-        inside = True
-        for d in range(3):
+        d = 0
+        while d < 3:
             local = box[d] * dx + box[3 + d] * dy + box[6 + d] * dz
             if local < box[12 + d] - radius or local > box[15 + d] + radius:
-                inside = False
-        if inside:
+                break
+            d += 1
+        if d == 3:
             return True
     return False
 
@@ -46,7 +50,7 @@ def wake(
     positions: Array,
     radius: Array,
     mass: Array,
-    sums: Array,
+    memory: Array,
     sensors: Array,
     load: float,
     share: float,
@@ -62,24 +66,36 @@ def wake(
         positions: (n, 3).
         radius: (n,) bounding spheres [m].
         mass: (n,) [kg].
-        sums: (n, 4) see `contacts.sum_impulses`.
+        memory: loaded contact points, see `contacts`.
         sensors: (k, 18) see `is_sensed`.
         load: change of the impulses' sum per mass above which a rock wakes, if it is above ... [m/s]
-        share: ... this multiple of half the sum of their sizes, too.
+        share: ... this multiple of half the sum of their sizes, the pressure, too.
         steps: for how many steps on end.
 
     Returns:
         number of rocks woken.
     """
+    n = len(book)
+    sums = np.empty((n, 3))
+    sum_impulses(memory, n, sums)
+    changed, pressures = np.zeros(n, np.bool_), np.empty(n)
+    change2 = np.empty(n)
+    for i in range(n):
+        if book[i, STATUS] == RESTING:
+            change2[i] = 0.0
+            for d in range(3):
+                change2[i] += (sums[i, d] - book[i, REFERENCE + d]) ** 2
+            changed[i] = change2[i] > (load * mass[i]) ** 2
+    if changed.any():
+        sum_pressures(memory, n, changed, pressures)
     n_woken = 0
-    for i in range(len(book)):
+    for i in range(n):
         if book[i, STATUS] != RESTING:
             continue
-        change2 = 0.0
-        for d in range(3):
-            change2 += (sums[i, d] - book[i, REFERENCE + d]) ** 2
-        limit = max(load * mass[i], share * sums[i, 3])
-        book[i, CHANGED_STEPS] = book[i, CHANGED_STEPS] + 1.0 if change2 > limit * limit else 0.0
+        if changed[i] and change2[i] > (share * pressures[i]) ** 2:
+            book[i, CHANGED_STEPS] += 1.0
+        else:
+            book[i, CHANGED_STEPS] = 0.0
         if book[i, CHANGED_STEPS] >= steps or is_sensed(
             positions[i, 0], positions[i, 1], positions[i, 2], radius[i], sensors
         ):
