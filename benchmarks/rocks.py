@@ -332,6 +332,8 @@ def bench_scaling(pile: PileState) -> None:
         f"scaling: a loading cycle of {steps} steps takes {seconds:.1f} CPU s with {len(pile)} rocks, "
         f"{extra:.1f} s more with {len(total)}: times {1.0 + extra / seconds:.2f}"
     )
+    share = (22_000 - len(pile)) / (len(total) - len(pile))
+    print(f"scaling: in proportion, with 22 000 rocks: times {1.0 + share * extra / seconds:.2f}")
 
 
 CASES: dict[str, Callable[[PileState], None]] = {
