@@ -128,7 +128,7 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
-    results = {(r["seed"], r["engine"], r["repeat"]): r for r in map(json.loads, lines)}
+    results = {(r["seed"], r["engine"], r.get("repeat", 0)): r for r in map(json.loads, lines)}
     site = SIZES["300"][1]
     settings = {key: float(value) for key, value in (item.split("=") for item in arguments.set)}
     iterations = settings.pop("iterations", float(NonsmoothConfig().iterations))
