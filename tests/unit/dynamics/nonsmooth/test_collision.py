@@ -303,6 +303,25 @@ def test_points_of_the_last_step_are_kept():
     np.testing.assert_allclose(find(0.02, 0.001, known=first[:, :3])[0], deepest)
 
 
+@pytest.mark.parametrize("ridge_below", [True, False])
+def test_faces_at_a_small_angle_make_one_manifold(ridge_below):
+    """A slab rests on, or is, a roof of 1 degree: whichever side is the better face, the manifold spans both."""
+    rise = 0.5 * np.tan(np.deg2rad(1.0))
+    roof = np.array([[x, y, z] for x, z in ((-0.5, 0.5), (0, 0.5 + rise), (0.5, 0.5)) for y in (-0.5, 0.5)])
+    roof = np.vstack([roof, BOX[BOX[:, 2] < 0]])
+    slab = 0.5 * BOX
+    below, above = (roof, slab) if ridge_below else (slab, -roof)
+    shapes = make_convex_shapes([below, above], [0.01, 0.01])
+    height = below[:, 2].max() - above[:, 2].min() + 0.004
+    spans = []
+    for tilt in np.deg2rad([-0.6, -0.2, 0.2, 0.6]):
+        r_b = Rotation.from_euler("y", tilt).as_matrix()
+        _, points = calc_manifold(shapes, np.eye(3), r_b, np.array([0.0, 0.0, height]), max_gap=0.02)
+        assert len(points) == 4
+        spans.append(np.ptp(points[:, 0]))
+    assert min(spans) > 0.4
+
+
 def test_overlapping_faces_keep_their_gaps():
     """Penetrating within the rounding: still the same four corners, gaps negative."""
     shapes = make_convex_shapes([BOX, 0.5 * BOX], [0.03, 0.03])

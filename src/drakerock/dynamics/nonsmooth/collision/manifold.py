@@ -2,7 +2,9 @@
 
 The face of one body that points best along the normal is the reference; the other body's face is clipped
 against the reference's sides (Sutherland and Hodgman) and the corners that remain, with their gaps, are
-thinned to four points that are far apart. Corners that carried load in the last step are preferred: faces that
+thinned to four points that are far apart. A side of a rock is often several faces at a few degrees: all that are
+within `min_cosine` of the normal take part on either body, or a manifold would end at the edge between two of them
+and jump when the other becomes the better one. Corners that carried load in the last step are preferred: faces that
 touch have many corners of nearly the same depth, and a choice by depth alone changes from step to step, which
 shakes the pile.
 """
@@ -29,26 +31,24 @@ CANDIDATE_WIDTH = 5
 
 
 @kernel
-def make_manifold_workspace() -> tuple[Array, Array, Array]:
-    """Return (outline, clipped, candidates): two outlines (MAX_OUTLINE, 3), (MAX_OUTLINE, CANDIDATE_WIDTH)."""
+def make_manifold_workspace() -> tuple[Array, Array, Array, Array]:
+    """Return (corners, outline, clipped, candidates), all of MAX_OUTLINE rows."""
     return (
         np.zeros((MAX_OUTLINE, 3)),
         np.zeros((MAX_OUTLINE, 3)),
+        np.zeros((MAX_OUTLINE, 4)),
         np.zeros((MAX_OUTLINE, CANDIDATE_WIDTH)),
     )
 
 
 @kernel
-def _find_face(
-    shapes: ConvexShapes, shape: int, r: Rotation, x: float, y: float, z: float
-) -> tuple[int, float]:
-    """Return the face of a core whose normal is nearest to (x, y, z) in W, and the cosine between them."""
-    lx, ly, lz = rotate_back(r, x, y, z)
+def _find_face(shapes: ConvexShapes, shape: int, x: float, y: float, z: float) -> tuple[int, float]:
+    """Return the face of a core whose normal is nearest to (x, y, z), and the cosine between them."""
     best = -2.0
     index = shapes.face_start[shape]
     normals = shapes.face_normals
     for face in range(shapes.face_start[shape], shapes.face_start[shape + 1]):
-        cosine = normals[face, 0] * lx + normals[face, 1] * ly + normals[face, 2] * lz
+        cosine = normals[face, 0] * x + normals[face, 1] * y + normals[face, 2] * z
         if cosine > best:
             best = cosine
             index = face
@@ -56,27 +56,25 @@ def _find_face(
 
 
 @kernel
+def _is_aligned(normals: Array, face: int, x: float, y: float, z: float, min_cosine: float) -> bool:
+    return bool(normals[face, 0] * x + normals[face, 1] * y + normals[face, 2] * z >= min_cosine)
+
+
+@kernel
 def _clip(
-    outline: Array,
-    n_points: int,
-    clipped: Array,
-    px: float,
-    py: float,
-    pz: float,
-    nx: float,
-    ny: float,
-    nz: float,
+    outline: Array, n_points: int, clipped: Array, nx: float, ny: float, nz: float, offset: float
 ) -> int:
-    """Cut away the part of an outline outside the plane through p with outward normal n; return the length."""
+    """Cut away the part of an outline outside the plane ``n p = offset``; return the number of its corners."""
+    n_outside = 0
+    for k in range(n_points):
+        clipped[k, 3] = outline[k, 0] * nx + outline[k, 1] * ny + outline[k, 2] * nz - offset
+        n_outside += clipped[k, 3] > 0.0
+    if n_outside == 0 or n_outside == n_points:
+        return n_points - n_outside
     n_kept = 0
     for k in range(n_points):
         follower = k + 1 if k + 1 < n_points else 0
-        d0 = (outline[k, 0] - px) * nx + (outline[k, 1] - py) * ny + (outline[k, 2] - pz) * nz
-        d1 = (
-            (outline[follower, 0] - px) * nx
-            + (outline[follower, 1] - py) * ny
-            + (outline[follower, 2] - pz) * nz
-        )
+        d0, d1 = clipped[k, 3], clipped[follower, 3]
         if d0 <= 0.0:
             for d in range(3):
                 clipped[n_kept, d] = outline[k, d]
@@ -168,7 +166,7 @@ def make_manifold(
     known: Array,
     n_known: int,
     points: Array,
-    workspace: tuple[Array, Array, Array],
+    workspace: tuple[Array, Array, Array, Array],
 ) -> int:
     """Extend the nearest point of a pair to a manifold of at most as many points as `points` has rows.
 
@@ -185,63 +183,81 @@ def make_manifold(
     Returns:
         the number of points, at least 1.
     """
-    face_a, cosine_a = _find_face(shapes, shape_a, r_a, nx, ny, nz)
-    face_b, cosine_b = _find_face(shapes, shape_b, r_b, -nx, -ny, -nz)
+    # The normal in either body's frame, outwards.
+    ax, ay, az = rotate_back(r_a, nx, ny, nz)
+    bx, by, bz = rotate_back(r_b, -nx, -ny, -nz)
+    face_a, cosine_a = _find_face(shapes, shape_a, ax, ay, az)
+    face_b, cosine_b = _find_face(shapes, shape_b, bx, by, bz)
     if max(cosine_a, cosine_b) < min_cosine:
         return 1
-    outline, clipped, candidates = workspace
-    # The reference's frame and the incident body's frame, both from A's origin.
+    corners, outline, clipped, candidates = workspace
+    roundings = scale_a * shapes.rounding[shape_a] + scale_b * shapes.rounding[shape_b]
+    # Reference and incident body; positions from A's origin.
     if cosine_a >= cosine_b:
         reference, incident, sign = face_a, face_b, 1.0
-        ref_scale, ref_r, rx, ry, rz = scale_a, r_a, 0.0, 0.0, 0.0
-        inc_scale, inc_r, ix, iy, iz = scale_b, r_b, px, py, pz
+        ref_scale, ref_r, rx, ry, rz, lx, ly, lz = scale_a, r_a, 0.0, 0.0, 0.0, ax, ay, az
+        inc_scale, inc_r, ix, iy, iz, mx, my, mz = scale_b, r_b, px, py, pz, bx, by, bz
         inc_rounding = scale_b * shapes.rounding[shape_b]
     else:
         reference, incident, sign = face_b, face_a, -1.0
-        ref_scale, ref_r, rx, ry, rz = scale_b, r_b, px, py, pz
-        inc_scale, inc_r, ix, iy, iz = scale_a, r_a, 0.0, 0.0, 0.0
+        ref_scale, ref_r, rx, ry, rz, lx, ly, lz = scale_b, r_b, px, py, pz, bx, by, bz
+        inc_scale, inc_r, ix, iy, iz, mx, my, mz = scale_a, r_a, 0.0, 0.0, 0.0, ax, ay, az
         inc_rounding = scale_a * shapes.rounding[shape_a]
-    roundings = scale_a * shapes.rounding[shape_a] + scale_b * shapes.rounding[shape_b]
-    normals = shapes.face_normals
-    fx, fy, fz = rotate(ref_r, normals[reference, 0], normals[reference, 1], normals[reference, 2])
-    first, last = shapes.face_vertex_start[incident], shapes.face_vertex_start[incident + 1]
-    n_outline = last - first
-    for k in range(n_outline):
-        x, y, z = get_corner(shapes.vertices, shapes.face_vertices[first + k], inc_scale, inc_r)
-        outline[k, 0], outline[k, 1], outline[k, 2] = x + ix, y + iy, z + iz
-    first, last = shapes.face_vertex_start[reference], shapes.face_vertex_start[reference + 1]
-    ax, ay, az = get_corner(shapes.vertices, shapes.face_vertices[last - 1], ref_scale, ref_r)
-    for k in range(first, last):
-        bx, by, bz = get_corner(shapes.vertices, shapes.face_vertices[k], ref_scale, ref_r)
-        ex, ey, ez = bx - ax, by - ay, bz - az
-        n_outline = _clip(
-            outline, n_outline, clipped, ax + rx, ay + ry, az + rz,
-            ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx,
-        )  # fmt: skip
-        if n_outline == 0:
-            return 1
-        ax, ay, az = bx, by, bz
-    ax, ay, az = ax + rx, ay + ry, az + rz
-    # Gaps are measured along the pair's normal, between the incident corner and the reference's plane.
-    along = sign * (fx * nx + fy * ny + fz * nz)
+    normals, near, sides = shapes.face_normals, shapes.near_faces, shapes.side_normals
     n_candidates = 0
-    for k in range(n_outline):
-        x, y, z = outline[k, 0], outline[k, 1], outline[k, 2]
-        gap = ((x - ax) * fx + (y - ay) * fy + (z - az) * fz) / along - roundings
-        if gap < max_gap:
-            shift = -sign * (inc_rounding + 0.5 * gap)
-            candidates[n_candidates, 0] = x + shift * nx
-            candidates[n_candidates, 1] = y + shift * ny
-            candidates[n_candidates, 2] = z + shift * nz
-            candidates[n_candidates, 3] = gap
-            n_candidates += 1
+    for j in range(shapes.near_start[incident], shapes.near_start[incident + 1]):
+        if near[j] != incident and not _is_aligned(normals, near[j], mx, my, mz, min_cosine):
+            continue
+        first = shapes.face_vertex_start[near[j]]
+        n_corners = shapes.face_vertex_start[near[j] + 1] - first
+        for k in range(n_corners):
+            x, y, z = get_corner(shapes.vertices, shapes.face_vertices[first + k], inc_scale, inc_r)
+            corners[k, 0], corners[k, 1], corners[k, 2] = rotate_back(
+                ref_r, x + ix - rx, y + iy - ry, z + iz - rz
+            )
+        for i in range(shapes.near_start[reference], shapes.near_start[reference + 1]):
+            if near[i] != reference and not _is_aligned(normals, near[i], lx, ly, lz, min_cosine):
+                continue
+            # In the reference's frame. Gaps are measured along the pair's normal, to the reference's plane.
+            fx, fy, fz = normals[near[i], 0], normals[near[i], 1], normals[near[i], 2]
+            along = fx * lx + fy * ly + fz * lz
+            level = ref_scale * shapes.face_offsets[near[i]] + roundings * along
+            limit = level + max_gap * along
+            least = np.inf
+            for k in range(n_corners):
+                x, y, z = corners[k, 0], corners[k, 1], corners[k, 2]
+                outline[k, 0], outline[k, 1], outline[k, 2] = x, y, z
+                least = min(least, x * fx + y * fy + z * fz)
+            if least >= limit:
+                continue
+            n_outline = n_corners
+            for k in range(shapes.face_vertex_start[near[i]], shapes.face_vertex_start[near[i] + 1]):
+                n_outline = _clip(
+                    outline, n_outline, clipped, sides[k, 0], sides[k, 1], sides[k, 2],
+                    ref_scale * shapes.side_offsets[k],
+                )  # fmt: skip
+            for k in range(n_outline):
+                x, y, z = outline[k, 0], outline[k, 1], outline[k, 2]
+                height = x * fx + y * fy + z * fz
+                if height < limit and n_candidates < len(candidates):
+                    candidates[n_candidates, 0] = x
+                    candidates[n_candidates, 1] = y
+                    candidates[n_candidates, 2] = z
+                    candidates[n_candidates, 3] = (height - level) / along
+                    n_candidates += 1
     if n_candidates == 0:
         return 1
+    for k in range(n_candidates):
+        x, y, z = rotate(ref_r, candidates[k, 0], candidates[k, 1], candidates[k, 2])
+        shift = -sign * (inc_rounding + 0.5 * candidates[k, 3])
+        candidates[k, 0] = x + rx + shift * nx
+        candidates[k, 1] = y + ry + shift * ny
+        candidates[k, 2] = z + rz + shift * nz
     radius = min(scale_a * shapes.radius[shape_a], scale_b * shapes.radius[shape_b])
-    first = find_first_point(candidates, n_candidates, known, n_known, radius)
+    chosen = find_first_point(candidates, n_candidates, known, n_known, radius)
     # Where a face or an edge carries, its corners do; the nearest point, which wanders over them, is dropped.
-    if n_candidates >= 2 and candidates[first, 3] < points[0, 3] + 1e-3:
+    if n_candidates >= 2 and candidates[chosen, 3] < points[0, 3] + 1e-3:
         for d in range(4):
-            points[0, d] = candidates[first, d]
+            points[0, d] = candidates[chosen, d]
     spread = 0.2 * radius
     return add_spread_points(candidates, n_candidates, points, 1, spread)

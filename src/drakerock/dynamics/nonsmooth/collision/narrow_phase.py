@@ -238,7 +238,7 @@ def find_contacts(
             nx, ny, nz = -plane[0], -plane[1], -plane[2]
             n_points = _find_plane_points(
                 shapes, shape_a, scale_a, r_a, positions[a, 0], positions[a, 1], positions[a, 2], plane,
-                margin + time_step * reach, known_points, n_known, points, manifold_workspace[2],
+                margin + time_step * reach, known_points, n_known, points, manifold_workspace[-1],
             )  # fmt: skip
             if n_points == 0:
                 continue
@@ -310,7 +310,7 @@ def find_contacts(
                 offset = nx * ax + ny * ay + nz * az + distance - scale_b * shapes.rounding[shape_b]
                 n_points = _add_fast_points(
                     shapes, shape_a, scale_a, r_a, nx, ny, nz, offset, max_gap, points, n_points,
-                    manifold_workspace[2],
+                    manifold_workspace[-1],
                 )  # fmt: skip
         tx, ty, tz, ux, uy, uz = make_tangents(nx, ny, nz)
         mu = 2.0 * friction[a] * friction[b] / (friction[a] + friction[b])

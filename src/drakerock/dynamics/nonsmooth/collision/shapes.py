@@ -17,6 +17,8 @@ from scipy.spatial import ConvexHull
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+# Faces within 15 degrees of each other are near.
+NEAR_COSINE = 0.966
 # How far a corner moves inwards at most [roundings].
 MAX_INSET = 4.0
 
@@ -30,7 +32,14 @@ class ConvexShapes(NamedTuple):
         face_start: (s + 1,).
         face_normals: (f, 3) outward.
         face_vertex_start: (f + 1,).
+        face_offsets: (f,) of the faces' planes, ``normal p = offset``.
         face_vertices: corners of each face, counter-clockwise seen from outside; indices into `vertices`.
+        side_normals: (.., 3) per corner of a face, of the side from it to the next corner: unit, in the face's plane,
+            outward.
+        side_offsets: of the planes that stand on these sides, ``normal p = offset``.
+        near_start: (f + 1,).
+        near_faces: of each face, itself and the others of its shape within `NEAR_COSINE` of it, indices into
+            `face_normals`.
         edge_start: (s + 1,).
         edge_vertices: (e, 2) indices into `vertices`.
         edge_faces: (e, 2) indices into `face_normals`.
@@ -43,7 +52,12 @@ class ConvexShapes(NamedTuple):
     face_start: IntArray
     face_normals: Array
     face_vertex_start: IntArray
+    face_offsets: Array
     face_vertices: IntArray
+    side_normals: Array
+    side_offsets: Array
+    near_start: IntArray
+    near_faces: IntArray
     edge_start: IntArray
     edge_vertices: IntArray
     edge_faces: IntArray
@@ -65,14 +79,30 @@ def make_convex_shapes(vertices: Sequence[Array], roundings: Sequence[float]) ->
     vertex_start = _make_starts([len(core) for core, _, _ in lists])
     face_start = _make_starts([len(faces) for _, faces, _ in lists])
     face_lists = [face + vertex_start[k] for k, (_, faces, _) in enumerate(lists) for face in faces]
+    near = [
+        face_start[k] + np.flatnonzero(normals @ normal > NEAR_COSINE)
+        for k, (_, _, normals) in enumerate(lists)
+        for normal in normals
+    ]
     edges = [_find_edges(faces) for _, faces, _ in lists]
+    outlines = [
+        (core[face], normal)
+        for core, faces, normals in lists
+        for face, normal in zip(faces, normals, strict=True)
+    ]
+    sides = [_calc_sides(outline, normal) for outline, normal in outlines]
     return ConvexShapes(
         vertex_start=vertex_start,
         vertices=_stack([core for core, _, _ in lists]),
         face_start=face_start,
         face_normals=_stack([normals for _, _, normals in lists]),
         face_vertex_start=_make_starts([len(face) for face in face_lists]),
+        face_offsets=np.array([normal @ outline[0] for outline, normal in outlines], float),
         face_vertices=np.concatenate([*face_lists, np.zeros(0, np.int64)]),
+        side_normals=_stack([side for side, _ in sides]),
+        side_offsets=np.concatenate([*(offset for _, offset in sides), np.zeros(0)]),
+        near_start=_make_starts([len(faces) for faces in near]),
+        near_faces=np.concatenate([*near, np.zeros(0, np.int64)]),
         edge_start=_make_starts([len(edge) for edge in edges]),
         edge_vertices=_stack_int([edge[:, :2] + vertex_start[k] for k, edge in enumerate(edges)]),
         edge_faces=_stack_int([edge[:, 2:] + face_start[k] for k, edge in enumerate(edges)]),
@@ -139,6 +169,13 @@ def _order_outline(points: Array, members: IntArray, normal: Array) -> IntArray:
     first = arms[0] / np.linalg.norm(arms[0])
     second = np.cross(normal, first)
     return members[np.argsort(np.arctan2(arms @ second, arms @ first))]
+
+
+def _calc_sides(outline: Array, normal: Array) -> tuple[Array, Array]:
+    """Return normals and offsets of the planes that stand on the sides of a face."""
+    sides = np.cross(np.roll(outline, -1, axis=0) - outline, normal)
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    return sides, (sides * outline).sum(axis=1)
 
 
 def _find_edges(faces: list[IntArray]) -> IntArray:
