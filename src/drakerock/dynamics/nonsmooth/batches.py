@@ -14,7 +14,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from drakerock.dynamics.nonsmooth.compiling import Array, kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, allocating_kernel, kernel
 from drakerock.dynamics.nonsmooth.contacts import (
     ARM_A,
     ARM_B,
@@ -70,7 +70,7 @@ def make_batch_arrays(n_rows: int) -> BatchArrays:
     )
 
 
-@kernel
+@allocating_kernel
 def make_batches(
     chosen: Array, body_a: Array, body_b: Array, still: int, marks: Array, members: Array, n_batches: int
 ) -> int:

@@ -255,6 +255,7 @@ class NonsmoothEngine:
         self._axis_keys = np.full(places, -1, np.int64)
         self._axes = np.zeros((places, 3), np.float32)
         self._statistics = np.zeros(4, np.int64)
+        self._narrow_workspace = narrow_phase.make_workspace()
         self._sums = np.zeros((n, 3))
         self._cell_start = np.zeros(2, np.int64)
         self._allocate_pairs(20 * n + 256)
@@ -622,7 +623,7 @@ class NonsmoothEngine:
                 self._velocities, self.solver_body, self.friction, self.restitution, self.time_step,
                 config.contact_margin, config.manifold_gap, config.face_cosine, config.manifold_points, memory, table,
                 self._axis_keys, self._axes, self._rows, self._body_a, self._body_b, self._row_key,
-                self._row_rock, self._statistics,
+                self._row_rock, self._statistics, self._narrow_workspace,
             )  # fmt: skip
             if n_rows <= len(self._rows):
                 return int(n_rows)

@@ -7,14 +7,14 @@ import math
 import numpy as np
 
 from drakerock.dynamics.nonsmooth.collision.broad_phase import rotate_inertia
-from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, Vector, kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, Vector, allocating_kernel, kernel
 from drakerock.dynamics.nonsmooth.solver import INVERSE_INERTIA, INVERSE_MASS
 
 # No sum of a rock's coordinates and velocities is larger; NaN is not smaller either.
 HUGE = 1e9
 
 
-@kernel
+@allocating_kernel
 def are_finite(values: Array) -> bool:
     """Return whether all values of a matrix are finite, and none is absurdly large."""
     finite = True
@@ -96,7 +96,7 @@ def add_gravity(awake: Array, bodies: Array, change: Array) -> None:
             bodies[awake[s], 3 + d] += change[d]
 
 
-@kernel
+@allocating_kernel
 def move(
     awake: Array,
     bodies: Array,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, LOST, RESTING
-from drakerock.dynamics.nonsmooth.compiling import Array, kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, allocating_kernel, kernel
 from drakerock.dynamics.nonsmooth.contacts import sum_impulses, sum_pressures
 
 # Columns of a rock's bookkeeping (all stored in the context).
@@ -44,7 +44,7 @@ def is_sensed(x: float, y: float, z: float, radius: float, sensors: Array) -> bo
     return False
 
 
-@kernel
+@allocating_kernel
 def wake(
     book: Array,
     positions: Array,

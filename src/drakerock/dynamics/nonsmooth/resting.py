@@ -11,7 +11,7 @@ from drakerock.dynamics.nonsmooth.batches import (
     solve_batch,
     unpack_impulses,
 )
-from drakerock.dynamics.nonsmooth.compiling import Array, kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, allocating_kernel, kernel
 from drakerock.dynamics.nonsmooth.contacts import IMPULSE
 from drakerock.dynamics.nonsmooth.solver import (
     INVERSE_INERTIA,
@@ -59,7 +59,7 @@ def _mark_neighbourhood(
                 marks[a] = distance + 1
 
 
-@kernel
+@allocating_kernel
 def _make_all_batches(
     n_free: int, n_rows: int, body_a: Array, body_b: Array, n_rocks: int, marks: Array, members: Array
 ) -> tuple[int, int]:
@@ -78,7 +78,7 @@ def _make_all_batches(
     return n_batches, make_batches(far[: n_free - n_near], body_a, body_b, n_rocks, marks, members, n_batches)
 
 
-@kernel
+@allocating_kernel
 def solve_resting(
     rows: Array,
     n_rows: int,

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drakerock.dynamics.nonsmooth.compiling import Array, Vector, kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, Vector, allocating_kernel, kernel
 from drakerock.dynamics.nonsmooth.contacts import (
     ARM_A,
     ARM_B,
@@ -186,7 +186,7 @@ def _relative_velocity_machine(row: Array, body_a: Array, spatial: Array) -> Vec
     )
 
 
-@kernel
+@allocating_kernel
 def prepare_rows(
     rows: Array,
     n_rows: int,
@@ -363,7 +363,7 @@ def solve_contact(row: Array, body_a: Array, body_b: Array) -> float:
     return change
 
 
-@kernel
+@allocating_kernel
 def solve_machine_contacts(
     rows: Array,
     order: Array,
@@ -455,7 +455,7 @@ def solve_machine_rows(machine: MachineArrays, velocity: Array) -> None:
             k += 2
 
 
-@kernel
+@allocating_kernel
 def apply_impulses(
     rows: Array,
     n_rows: int,
@@ -494,7 +494,7 @@ def _calc_impulse(row: Array) -> Vector:
     )
 
 
-@kernel
+@allocating_kernel
 def sum_machine_impulses(
     rows: Array,
     n_rows: int,
@@ -530,7 +530,7 @@ def sum_machine_impulses(
     return sums
 
 
-@kernel
+@allocating_kernel
 def solve_impacts(
     rows: Array,
     n_rows: int,

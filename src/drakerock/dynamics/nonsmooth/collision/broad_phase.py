@@ -11,7 +11,7 @@ import numpy as np
 
 from drakerock.dynamics.nonsmooth.collision.geometry import get_corner, get_rotation
 from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
-from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, allocating_kernel, kernel
 
 # How a rock is treated.
 AWAKE, RESTING, FIXED, LOST = 0, 1, 2, 3
@@ -24,7 +24,7 @@ def _find_cell(value: float, origin: float, inverse_width: float, n_cells: int) 
     return min(int((value - origin) * inverse_width), n_cells - 1)
 
 
-@kernel
+@allocating_kernel
 def find_region(awake: Array, others: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
     """Return the corners (3,) of the box around the boxes of awake rocks and of other bodies [m]."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -36,7 +36,7 @@ def find_region(awake: Array, others: Array, lower: Array, upper: Array) -> tupl
     return low, high
 
 
-@kernel
+@allocating_kernel
 def find_near(
     rocks: Array, positions: Array, low: Array, high: Array, reach: float, near: Array
 ) -> tuple[int, Array, Array]:

@@ -20,6 +20,7 @@ from drakerock.dynamics.nonsmooth.collision.gjk import (
     calc_core_distance,
     make_gjk_workspace,
 )
+from drakerock.dynamics.nonsmooth.collision.gjk import Workspace as GjkWorkspace
 from drakerock.dynamics.nonsmooth.collision.manifold import (
     KNOWN,
     MAX_POINTS,
@@ -30,7 +31,7 @@ from drakerock.dynamics.nonsmooth.collision.manifold import (
 )
 from drakerock.dynamics.nonsmooth.collision.overlap import calc_core_penetration
 from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
-from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, allocating_kernel, kernel
 from drakerock.dynamics.nonsmooth.contacts import (
     ARM_A,
     ARM_B,
@@ -55,6 +56,20 @@ from drakerock.dynamics.nonsmooth.contacts import (
 MIN_COSINE_TO_HISTORY = 0.5
 # A way per step from which on all corners of a rock count against plates and other solid pieces [m].
 FAST = 0.03
+
+
+Workspace = tuple[GjkWorkspace, tuple[Array, Array, Array, Array], Array, Array]
+
+
+@allocating_kernel
+def make_workspace() -> Workspace:
+    """Return scratch memory of the narrow phase: distances, manifolds, a pair's points, those of the last step."""
+    return (
+        make_gjk_workspace(),
+        make_manifold_workspace(),
+        np.zeros((MAX_POINTS, 4)),
+        np.zeros((MAX_POINTS, 3)),
+    )
 
 
 @kernel
@@ -167,6 +182,7 @@ def find_contacts(
     row_key: Array,
     row_rock: Array,
     statistics: Array,
+    workspace: Workspace,
 ) -> int:
     """Find the contact points of all pairs.
 
@@ -192,14 +208,13 @@ def find_contacts(
         axis_keys, axes: cache of separating axes: skips pairs, never changes a result.
         rows, body_a, body_b, row_key, row_rock: set, see `contacts`.
         statistics: (4,) set: pairs skipped, distances computed, overlapping cores, rows.
+        workspace: from `make_workspace`.
 
     Returns:
         number of rows; beyond the capacity they are counted but not stored.
     """
-    gjk_workspace = make_gjk_workspace()
-    manifold_workspace = make_manifold_workspace()
-    points = np.zeros((max_points, 4))
-    known_points = np.zeros((MAX_POINTS, 3))
+    gjk_workspace, manifold_workspace, all_points, known_points = workspace
+    points = all_points[:max_points]
     n_rows = 0
     statistics[:] = 0
     for pair in range(n_pairs):
