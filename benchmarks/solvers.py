@@ -56,13 +56,14 @@ def find_problems(n_piles: int, every: int) -> list[Problem]:
 
     def keep(
         rows: Array, n: int, a: Array, b: Array, awake: Array, bodies: Array, n_rocks: int, *rest: Any
-    ) -> float:
+    ) -> tuple[float, int]:
         nonlocal count
         count += 1
         if count % every == 0 and (b[:n] > n_rocks).sum() > 3:
             problem = Problem(rows[:n], a[:n], b[:n], awake, bodies, n_rocks, rest[0], rest[1])
             problems.append(problem.copy())
-        return float(usual(rows, n, a, b, awake, bodies, n_rocks, *rest))
+        residual, n_sweeps = usual(rows, n, a, b, awake, bodies, n_rocks, *rest)
+        return float(residual), int(n_sweeps)
 
     n, site, height = SIZES["300"]
     for pile_seed in range(n_piles):
@@ -195,8 +196,8 @@ def solve_as_engine(problem: Problem, iterations: int, machine_sweeps: int) -> t
     )
     start = time.process_time()
     resting.solve_resting(
-        rows, len(rows), body_a, body_b, awake, bodies, n_rocks, machine, velocity, iterations, machine_sweeps,
-        *scratch,
+        rows, len(rows), body_a, body_b, awake, bodies, n_rocks, machine, velocity, iterations, iterations, 0.0,
+        machine_sweeps, *scratch,
     )  # fmt: skip
     return problem, time.process_time() - start
 

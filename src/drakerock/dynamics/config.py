@@ -42,7 +42,17 @@ class RestConfig(Config):
 class NonsmoothConfig(Config):
     """The nonsmooth engine: stepper, contact solve, collision margins, reduction."""
 
-    iterations: Annotated[int, Field(ge=1, le=2000, description="sweeps of the resting stage")] = 50
+    iterations: Annotated[
+        int, Field(ge=1, le=2000, description="least number of sweeps of the resting stage")
+    ] = 50
+    tolerance: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1,
+            description="sweeps go on, up to four times as many, until one changes the machine's forces by less",
+        ),
+    ] = 3e-4
     machine_sweeps: Annotated[
         int, Field(ge=0, le=100, description="further sweeps per sweep over the contacts around the machine")
     ] = 3

@@ -36,8 +36,8 @@ _log = logging.getLogger(__name__)
 GRAVITY = 9.81
 # How far outside the site's box a rock still counts as inside [m].
 SITE_MARGIN = 0.5
-# A step that failed is solved again with this many times the iterations, from a cold start; a step that begins with
-# an overlap beyond this share of the bound is solved with as many at once. A light rock that the machine presses into
+# Sweeps that the machine's forces ask for are at most this many times the iterations. A step that failed is solved
+# again with as many, from a cold start; one that begins with an overlap beyond this share of the bound has them at once. A light rock that the machine presses into
 # a jammed pile passes on little of the machine's momentum per iteration, and is squeezed meanwhile.
 RETRY_FACTOR = 4
 DEEP_SHARE = 0.375
@@ -106,7 +106,8 @@ class StepReport:
         machine_velocity: (v,) the machine's generalised velocities as the contact solve left them.
         n_awake: rocks awake in the step.
         n_contacts: contact points; n_loaded of them carry load.
-        residual: last sweep's change of the normal impulses over their sum.
+        n_sweeps: sweeps of the resting stage.
+        residual: the last one's change of the normal impulses over their sum.
         max_penetration, p99_penetration: of loaded points [m].
         n_woken, n_rested, n_lost: rocks that changed state (lost: left the site) in this step.
         redone: the step was solved again with more iterations.
@@ -119,6 +120,7 @@ class StepReport:
     n_awake: int
     n_contacts: int
     n_loaded: int
+    n_sweeps: int
     residual: float
     max_penetration: float
     p99_penetration: float
@@ -484,9 +486,10 @@ class NonsmoothEngine:
             solver.damp_spin(rows, n_rows, body_a, body_b, self._bodies, n, config.spin_damping * dt)
         motion.add_gravity(awake, self._bodies, np.array([0.0, 0.0, -self.gravity * dt]))
         velocity += machine.free_change
-        residual = resting.solve_resting(
-            rows, n_rows, body_a, body_b, awake, self._bodies, n, machine.arrays, velocity, iterations,
-            config.machine_sweeps, self._batches, self._bodies_32, self._marks,
+        residual, n_sweeps = resting.solve_resting(
+            rows, n_rows, body_a, body_b, awake, self._bodies, n, machine.arrays, velocity,
+            iterations, max(iterations, RETRY_FACTOR * config.iterations), config.tolerance, config.machine_sweeps,
+            self._batches, self._bodies_32, self._marks,
         )  # fmt: skip
 
         new.quaternions[:] = arrays.quaternions
@@ -531,6 +534,7 @@ class NonsmoothEngine:
             n_awake=len(awake),
             n_contacts=n_rows,
             n_loaded=int(loaded.sum()),
+            n_sweeps=n_sweeps,
             residual=residual,
             max_penetration=max_penetration,
             p99_penetration=float(_calc_percentile(depths, 0.99)),

@@ -78,6 +78,15 @@ def _make_all_batches(
     return n_batches, make_batches(far[: n_free - n_near], body_a, body_b, n_rocks, marks, members, n_batches)
 
 
+@kernel
+def sum_normal_impulses(rows: Array, first: int, last: int) -> float:
+    """Return the sum of the normal impulses of a range of rows [N s]."""
+    total = 0.0
+    for k in range(first, last):
+        total += rows[k, IMPULSE]
+    return total
+
+
 @allocating_kernel
 def solve_resting(
     rows: Array,
@@ -90,15 +99,18 @@ def solve_resting(
     machine: MachineArrays,
     velocity: Array,
     iterations: int,
+    max_iterations: int,
+    tolerance: float,
     machine_sweeps: int,
     batches: BatchArrays,
     bodies_32: Array,
     marks: Array,
-) -> float:
-    """The resting stage: `iterations` symmetric sweeps, forwards and backwards in turn.
+) -> tuple[float, int]:
+    """The resting stage: symmetric sweeps, forwards and backwards in turn.
 
-    Each is followed by `machine_sweeps` over the machine's own rows, its contacts and their neighbourhood. A light rock
-    that the machine presses on others passes on little of the machine's momentum per sweep.
+    They go on until the forces on the machine have settled, which takes longest where it presses on a jam. Each is
+    followed by `machine_sweeps` over the machine's own rows, its contacts and their neighbourhood. A light rock that
+    the machine presses on others passes on little of the machine's momentum per sweep.
 
     The sweeps over the rocks run in single precision; the velocities are then made anew from the impulses in
     double precision, so that momentum is kept to rounding.
@@ -109,14 +121,15 @@ def solve_resting(
         awake: (m,) rocks that can move.
         bodies, machine, velocity: with gravity and free velocities, without the warm start; changed.
         n_rocks: see `prepare_rows`.
-        iterations: number of sweeps over all contacts.
+        iterations, max_iterations: least and greatest number of sweeps over all contacts.
+        tolerance: sweeps end when one changes the normal impulses on the machine by less than this share of their sum.
         machine_sweeps: further sweeps about the machine after each.
         batches: room for as many rows.
         bodies_32: (n_rocks + 1, BODY_WIDTH) float32 scratch; has to be zero and is left so.
         marks: (bodies of the solve,) scratch.
 
     Returns:
-        the residual: the last whole sweep's change of the normal impulses over their sum.
+        the residual, which is the last whole sweep's change of the normal impulses over their sum; the sweeps done.
     """
     free = np.empty((len(awake), 6))
     for s in range(len(awake)):
@@ -132,7 +145,9 @@ def solve_resting(
     n_near, n_batches = _make_all_batches(n_free, n_rows, body_a, body_b, n_rocks, marks, batches.members)
     pack(rows, body_a, body_b, n_rocks, batches, n_batches)
     changed = 0.0
-    for iteration in range(iterations):
+    iteration = 0
+    while iteration < max_iterations:
+        settled = False
         for sweep in range(1 + machine_sweeps):
             n = n_batches if sweep == 0 else n_near
             if len(machine.row_values) > 0:
@@ -152,6 +167,10 @@ def solve_resting(
                     solve_batch(batches, k, bodies_32)
             if sweep == 0:
                 changed = change + float(batches.changes.sum())
+                settled = change <= tolerance * sum_normal_impulses(rows, n_free, n_rows)
+        iteration += 1
+        if settled and iteration >= iterations:
+            break
     unpack_impulses(batches, n_batches, rows)
     for s in range(len(awake)):
         for d in range(6):
@@ -159,7 +178,5 @@ def solve_resting(
         # What is not awake stays zero: at rest, and immovable.
         bodies_32[awake[s]] = 0.0
     apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, np.zeros(len(velocity)))
-    total = 0.0
-    for k in range(n_rows):
-        total += rows[k, IMPULSE]
-    return changed / total if total > 0.0 else 0.0
+    total = sum_normal_impulses(rows, 0, n_rows)
+    return changed / total if total > 0.0 else 0.0, iteration

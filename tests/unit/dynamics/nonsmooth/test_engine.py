@@ -395,9 +395,9 @@ def make_ram(mass: float, speed: float) -> tuple[MachinePiece, MachineStep]:
     return MachinePiece(0, plate, 0.5), step
 
 
-def test_sweeps_around_the_machine_bring_its_momentum_through_light_rocks():
-    """40 t at 0.3 m/s push three rocks of 21 kg against one that is fixed."""
-    piece, ram = make_ram(40e3, 0.3)
+def push_light_rocks(speed, **settings):
+    """A step in which 40 t push three rocks of 21 kg against one that is fixed."""
+    piece, ram = make_ram(40e3, speed)
     width = 0.2
     x = width * (0.5 + np.arange(4))
     pile = make_pile(
@@ -405,15 +405,17 @@ def test_sweeps_around_the_machine_bring_its_momentum_through_light_rocks():
         size=np.full(4, width),
         fixed=[False, False, False, True],
     )
+    config = NonsmoothConfig(reduction="none", max_residual=1e9, rounding=1e-6, **settings)
+    engine = make_engine(
+        pile, [make_box(1, 1, 1)], config=config, gravity=0.0, pieces=[piece], n_machine_bodies=1
+    )
+    return engine, engine.step(engine.make_arrays(pile), ram)[1]
+
+
+def test_sweeps_around_the_machine_bring_its_momentum_through_light_rocks():
     left = {}
     for sweeps, iterations in ((0, 50), (3, 50), (0, 200), (0, 2000)):
-        config = NonsmoothConfig(
-            reduction="none", machine_sweeps=sweeps, iterations=iterations, max_residual=1e9, rounding=1e-6
-        )
-        engine = make_engine(
-            pile, [make_box(1, 1, 1)], config=config, gravity=0.0, pieces=[piece], n_machine_bodies=1
-        )
-        _, report = engine.step(engine.make_arrays(pile), ram)
+        engine, report = push_light_rocks(0.3, machine_sweeps=sweeps, iterations=iterations, tolerance=1.0)
         left[sweeps, iterations] = report.machine_velocity[0]
         # what the rocks got is what the machine lost, however many sweeps there were
         assert -report.F_Bs_W[0, 3] * engine.time_step == pytest.approx(
@@ -423,6 +425,21 @@ def test_sweeps_around_the_machine_bring_its_momentum_through_light_rocks():
     assert brought[0, 2000] > 5.0 * brought[0, 50]
     assert brought[3, 50] > 3.0 * brought[0, 50]
     assert brought[3, 50] == pytest.approx(brought[0, 200], rel=0.15)
+
+
+def test_sweeps_go_on_until_the_forces_on_the_machine_have_settled():
+    _, converged = push_light_rocks(0.3, iterations=2000, tolerance=1.0)
+    brought = 0.3 - converged.machine_velocity[0]
+    errors, sweeps = [], []
+    for tolerance in (1.0, 3e-2, 3e-3):
+        _, report = push_light_rocks(0.3, iterations=5, tolerance=tolerance)
+        errors.append(abs(0.3 - report.machine_velocity[0] - brought) / brought)
+        sweeps.append(report.n_sweeps)
+    assert sweeps[0] == 5
+    assert 5 < sweeps[1] < sweeps[2] == 20  # four times as many at most
+    assert errors[2] < errors[1] < errors[0]
+    # Nothing pushes: no sweep more than the least.
+    assert push_light_rocks(-0.3, iterations=5, tolerance=1e-6)[1].n_sweeps == 5
 
 
 def test_deep_overlap_recovers_slowly():
