@@ -37,8 +37,9 @@ GRAVITY = 9.81
 # How far outside the site's box a rock still counts as inside [m].
 SITE_MARGIN = 0.5
 # Sweeps that the machine's forces ask for are at most this many times the iterations. A step that failed is solved
-# again with as many, from a cold start; one that begins with an overlap beyond this share of the bound has them at once. A light rock that the machine presses into
-# a jammed pile passes on little of the machine's momentum per iteration, and is squeezed meanwhile.
+# again with as many, from a cold start; one that begins with an overlap beyond this share of the bound has them at
+# once. A light rock that the machine presses into a jammed pile passes on little of the machine's momentum per
+# iteration, and is squeezed meanwhile.
 RETRY_FACTOR = 4
 DEEP_SHARE = 0.375
 
