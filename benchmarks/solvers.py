@@ -3,9 +3,9 @@
     python benchmarks/solvers.py --piles 3
 
 Problems are single steps out of digs of 300 rocks, warm started as they were. The solution is 6000 plain sweeps.
-Compared are the engine's solve with and without further sweeps about the machine, and two ways of accelerating plain
-sweeps: nonlinear conjugate gradients (Silcowitz-Hansen, Niebe, Erleben 2010) and Anderson's mixing of the last
-iterates, both measured by impulses times their rows' inverse inertia.
+Compared are the engine's solve with and without further sweeps about the machine, with and without a tolerance, and
+two ways of accelerating plain sweeps: nonlinear conjugate gradients (Silcowitz-Hansen, Niebe, Erleben 2010) and
+Anderson's mixing of the last iterates, both measured by impulses times their rows' inverse inertia.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from drakerock.dynamics.config import NonsmoothConfig
 from drakerock.dynamics.nonsmooth import contacts, resting, solver
 from drakerock.dynamics.nonsmooth.batches import make_batch_arrays
 from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.engine import RETRY_FACTOR
 
 Array = NDArray[Any]
 Accelerator = Callable[[Array, Array], Array]
@@ -185,8 +186,11 @@ def solve(problem: Problem, sweeps: int, make: Callable[[Problem], Accelerator] 
     return problem
 
 
-def solve_as_engine(problem: Problem, iterations: int, machine_sweeps: int) -> tuple[Problem, float]:
-    """Solve by the engine's kernel; return the CPU time as well [s]."""
+def solve_as_engine(
+    problem: Problem, iterations: int, machine_sweeps: int, tolerance: float | None
+) -> tuple[Problem, float, int]:
+    """Solve by the engine's kernel; return the CPU time [s] and the number of sweeps as well."""
+    most = iterations if tolerance is None else RETRY_FACTOR * iterations
     problem = problem.copy()
     rows, body_a, body_b, awake, bodies, n_rocks, machine, velocity = problem
     scratch = (
@@ -195,11 +199,11 @@ def solve_as_engine(problem: Problem, iterations: int, machine_sweeps: int) -> t
         np.zeros(n_rocks + 1 + len(machine.jacobian), np.int64),
     )
     start = time.process_time()
-    resting.solve_resting(
-        rows, len(rows), body_a, body_b, awake, bodies, n_rocks, machine, velocity, iterations, iterations, 0.0,
-        machine_sweeps, *scratch,
+    _, n_sweeps = resting.solve_resting(
+        rows, len(rows), body_a, body_b, awake, bodies, n_rocks, machine, velocity, iterations, most,
+        tolerance or 0.0, machine_sweeps, *scratch,
     )  # fmt: skip
-    return problem, time.process_time() - start
+    return problem, time.process_time() - start, n_sweeps
 
 
 def calc_push(problem: Problem) -> float:
@@ -234,22 +238,28 @@ def main() -> None:
             flush=True,
         )
 
-    for iterations, machine_sweeps in (
-        (50, 0),
-        (50, 1),
-        (50, 3),
-        (50, 7),
-        (100, 0),
-        (100, 3),
-        (100, 7),
-        (150, 3),
-        (200, 0),
-        (200, 3),
-        (400, 0),
+    for iterations, machine_sweeps, tolerance in (
+        (50, 0, None),
+        (50, 1, None),
+        (50, 3, None),
+        (50, 7, None),
+        (50, 3, 1e-3),
+        (50, 3, 3e-4),
+        (50, 3, 1e-4),
+        (100, 0, None),
+        (100, 3, None),
+        (100, 7, None),
+        (150, 3, None),
+        (200, 0, None),
+        (200, 3, None),
+        (400, 0, None),
     ):
-        pairs = [solve_as_engine(problem, iterations, machine_sweeps) for problem in problems]
-        name = f"engine {iterations}, machine_sweeps {machine_sweeps}"
-        show(name, [problem for problem, _ in pairs], float(np.median([cpu for _, cpu in pairs])))
+        results = [solve_as_engine(problem, iterations, machine_sweeps, tolerance) for problem in problems]
+        sweeps = np.mean([n_sweeps for _, _, n_sweeps in results])
+        name = f"engine {sweeps:.0f}, machine_sweeps {machine_sweeps}" + (
+            "" if tolerance is None else f", {tolerance:g}"
+        )
+        show(name, [problem for problem, _, _ in results], float(np.mean([cpu for _, cpu, _ in results])))
     for sweeps in (50, 100, 200):
         show(
             f"conjugate gradients {sweeps}", [solve(problem, sweeps, make_conjugate) for problem in problems]
