@@ -23,7 +23,7 @@ from rocks import TIME_STEP, clear_way, make_dig, run_dig
 from drakerock.dynamics.config import NonsmoothConfig
 from drakerock.dynamics.nonsmooth import contacts, resting, solver
 from drakerock.dynamics.nonsmooth.batches import make_batch_arrays
-from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.dynamics.nonsmooth.compiling import allocating_kernel
 from drakerock.dynamics.nonsmooth.engine import RETRY_FACTOR
 
 Array = NDArray[Any]
@@ -78,7 +78,7 @@ def find_problems(n_piles: int, every: int) -> list[Problem]:
     return problems
 
 
-@kernel
+@allocating_kernel
 def sweep(
     rows: Array, n_free: int, order: Array, body_a: Array, body_b: Array, bodies: Array, n_rocks: int,
     machine: solver.MachineArrays, velocity: Array, forwards: bool,
