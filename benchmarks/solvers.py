@@ -88,10 +88,12 @@ def sweep(
     if forwards:
         for k in range(n_free):
             solver.solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]])
-        solver.solve_machine_contacts(rows, order, body_a, body_b, bodies, n_rocks, machine, velocity)
+        solver.solve_machine_contacts(
+            rows, order, body_a, body_b, bodies, n_rocks, machine, velocity, np.empty((3, 6))
+        )
     else:
         solver.solve_machine_contacts(
-            rows, order[::-1].copy(), body_a, body_b, bodies, n_rocks, machine, velocity
+            rows, order[::-1].copy(), body_a, body_b, bodies, n_rocks, machine, velocity, np.empty((3, 6))
         )
         for k in range(n_free - 1, -1, -1):
             solver.solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]])
@@ -187,7 +189,7 @@ def solve(problem: Problem, sweeps: int, make: Callable[[Problem], Accelerator] 
 
 
 def solve_as_engine(
-    problem: Problem, iterations: int, machine_sweeps: int, tolerance: float | None
+    problem: Problem, iterations: int, machine_sweeps: int, tolerance: float | None, momentum: float
 ) -> tuple[Problem, float, int]:
     """Solve by the engine's kernel; return the CPU time [s] and the number of sweeps as well."""
     most = iterations if tolerance is None else RETRY_FACTOR * iterations
@@ -201,7 +203,7 @@ def solve_as_engine(
     start = time.process_time()
     _, n_sweeps = resting.solve_resting(
         rows, len(rows), body_a, body_b, awake, bodies, n_rocks, machine, velocity, iterations, most,
-        tolerance or 0.0, machine_sweeps, *scratch,
+        tolerance or 0.0, machine_sweeps, momentum, *scratch,
     )  # fmt: skip
     return problem, time.process_time() - start, n_sweeps
 
@@ -233,30 +235,37 @@ def main() -> None:
             speed.append(1e3 * np.sqrt(mass @ (change**2).sum(axis=1) / mass.sum()))
         cost = "" if cpu is None else f", {1e3 * cpu:.2f} ms"
         print(
-            f"{name:34s} push off by {np.mean(push):5.1f} kN, 90th percentile {np.percentile(push, 90):5.1f}; "
+            f"{name:50s} push off by {np.mean(push):5.1f} kN, 90th percentile {np.percentile(push, 90):5.1f}; "
             f"rms speed by {np.median(speed):5.1f} mm/s, 90th percentile {np.percentile(speed, 90):5.1f}{cost}",
             flush=True,
         )
 
-    for iterations, machine_sweeps, tolerance in (
-        (50, 0, None),
-        (50, 1, None),
-        (50, 3, None),
-        (50, 7, None),
-        (50, 3, 1e-3),
-        (50, 3, 3e-4),
-        (50, 3, 1e-4),
-        (100, 0, None),
-        (100, 3, None),
-        (100, 7, None),
-        (150, 3, None),
-        (200, 0, None),
-        (200, 3, None),
-        (400, 0, None),
+    for iterations, machine_sweeps, tolerance, momentum in (
+        (50, 0, None, 0.0),
+        (50, 1, None, 0.0),
+        (50, 3, None, 0.0),
+        (100, 3, None, 0.0),
+        (200, 3, None, 0.0),
+        (400, 0, None, 0.0),
+        (50, 0, None, 0.8),
+        (50, 1, None, 0.8),
+        (50, 3, None, 0.8),
+        (75, 1, None, 0.8),
+        (75, 1, 3e-4, 0.8),
+        (75, 3, 3e-4, 0.8),
+        (75, 7, 3e-4, 0.8),
+        (100, 0, None, 0.8),
+        (100, 1, None, 0.8),
+        (100, 3, None, 0.6),
+        (100, 3, None, 0.8),
+        (100, 3, None, 0.9),
+        (200, 3, None, 0.8),
     ):
-        results = [solve_as_engine(problem, iterations, machine_sweeps, tolerance) for problem in problems]
+        results = [
+            solve_as_engine(problem, iterations, machine_sweeps, tolerance, momentum) for problem in problems
+        ]
         sweeps = np.mean([n_sweeps for _, _, n_sweeps in results])
-        name = f"engine {sweeps:.0f}, machine_sweeps {machine_sweeps}" + (
+        name = f"engine {sweeps:.0f}, machine_sweeps {machine_sweeps}, momentum {momentum:g}" + (
             "" if tolerance is None else f", {tolerance:g}"
         )
         show(name, [problem for problem, _, _ in results], float(np.mean([cpu for _, cpu, _ in results])))

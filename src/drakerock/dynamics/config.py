@@ -17,8 +17,8 @@ class RestConfig(Config):
 
     displacement: Annotated[
         float, Field(gt=0, description="a rock rests when it moved less than this [m] ...")
-    ] = 0.001
-    time: Annotated[float, Field(gt=0, description="... within this time [s]")] = 0.1
+    ] = 0.0001
+    time: Annotated[float, Field(gt=0, description="... within this time [s]")] = 0.04
     speed: Annotated[float, Field(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
     wake_load: Annotated[
         float,
@@ -44,7 +44,7 @@ class NonsmoothConfig(Config):
 
     iterations: Annotated[
         int, Field(ge=1, le=2000, description="least number of sweeps of the resting stage")
-    ] = 50
+    ] = 100
     tolerance: Annotated[
         float,
         Field(
@@ -55,7 +55,15 @@ class NonsmoothConfig(Config):
     ] = 3e-4
     machine_sweeps: Annotated[
         int, Field(ge=0, le=100, description="further sweeps per sweep over the contacts around the machine")
-    ] = 3
+    ] = 1
+    momentum: Annotated[
+        float,
+        Field(
+            ge=0,
+            lt=1,
+            description="greatest share of two sweeps' change by which they are continued; 0: none",
+        ),
+    ] = 0.8
     impact_iterations: Annotated[int, Field(ge=1, le=500, description="sweeps of the impact stage")] = 10
     impact_threshold: Annotated[
         float, Field(gt=0, description="contacts that approach faster are impacts [m/s]")

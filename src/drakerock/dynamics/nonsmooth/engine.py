@@ -489,8 +489,8 @@ class NonsmoothEngine:
         velocity += machine.free_change
         residual, n_sweeps = resting.solve_resting(
             rows, n_rows, body_a, body_b, awake, self._bodies, n, machine.arrays, velocity,
-            iterations, max(iterations, RETRY_FACTOR * config.iterations), config.tolerance, config.machine_sweeps,
-            self._batches, self._bodies_32, self._marks,
+            iterations, max(iterations, RETRY_FACTOR * config.iterations), config.tolerance,
+            config.machine_sweeps, config.momentum, self._batches, self._bodies_32, self._marks,
         )  # fmt: skip
 
         new.quaternions[:] = arrays.quaternions

@@ -1,10 +1,11 @@
-"""The contact solve's resting stage: sweeps over all contacts, and further ones about the machine."""
+"""The contact solve's resting stage: sweeps over all contacts with momentum, and further ones about the machine."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from drakerock.dynamics.nonsmooth.batches import (
+    FIELDS,
     BatchArrays,
     make_batches,
     pack,
@@ -13,8 +14,11 @@ from drakerock.dynamics.nonsmooth.batches import (
 )
 from drakerock.dynamics.nonsmooth.compiling import Array, allocating_kernel, kernel
 from drakerock.dynamics.nonsmooth.contacts import IMPULSE
+from drakerock.dynamics.nonsmooth.lanes import LANES
+from drakerock.dynamics.nonsmooth.momentum import calc_share, go_on
 from drakerock.dynamics.nonsmooth.solver import (
     INVERSE_INERTIA,
+    ROW_IMPULSE,
     MachineArrays,
     apply_impulses,
     solve_machine_contacts,
@@ -102,6 +106,7 @@ def solve_resting(
     max_iterations: int,
     tolerance: float,
     machine_sweeps: int,
+    momentum: float,
     batches: BatchArrays,
     bodies_32: Array,
     marks: Array,
@@ -110,7 +115,8 @@ def solve_resting(
 
     They go on until the forces on the machine have settled, which takes longest where it presses on a jam. Each is
     followed by `machine_sweeps` over the machine's own rows, its contacts and their neighbourhood. A light rock that
-    the machine presses on others passes on little of the machine's momentum per sweep.
+    the machine presses on others passes on little of the machine's momentum per sweep. After every second one all are
+    continued on their way, see `momentum`.
 
     The sweeps over the rocks run in single precision; the velocities are then made anew from the impulses in
     double precision, so that momentum is kept to rounding.
@@ -124,6 +130,7 @@ def solve_resting(
         iterations, max_iterations: least and greatest number of sweeps over all contacts.
         tolerance: sweeps end when one changes the normal impulses on the machine by less than this share of their sum.
         machine_sweeps: further sweeps about the machine after each.
+        momentum: at most this share of two sweeps' change is added to them, see `momentum`; 0: none.
         batches: room for as many rows.
         bodies_32: (n_rocks + 1, BODY_WIDTH) float32 scratch; has to be zero and is left so.
         marks: (bodies of the solve,) scratch.
@@ -142,8 +149,15 @@ def solve_resting(
     n_free = _find_machine_rows(n_rows, body_b, n_rocks)
     forwards = np.arange(n_free, n_rows)
     backwards = forwards[::-1].copy()
+    scratch = np.empty((3, 6))
     n_near, n_batches = _make_all_batches(n_free, n_rows, body_a, body_b, n_rocks, marks, batches.members)
     pack(rows, body_a, body_b, n_rocks, batches, n_batches)
+    every_batch, every_motor = np.arange(n_batches), np.arange(len(machine.row_values))
+    one_body, fields = np.zeros(1, np.int64), batches.fields.reshape(len(batches.fields), FIELDS * LANES)
+    last_impulses = np.zeros((n_batches, 3 * LANES), np.float32)
+    last_velocities = np.zeros((len(awake), 6), np.float32)
+    last_machine_impulses = np.zeros((n_rows - n_free, 3))
+    last_motors, last_velocity = np.zeros((len(every_motor), 1)), np.zeros((1, len(velocity)))
     changed = 0.0
     iteration = 0
     while iteration < max_iterations:
@@ -157,11 +171,11 @@ def solve_resting(
                 for k in range(n):
                     solve_batch(batches, k, bodies_32)
                 change = solve_machine_contacts(
-                    rows, forwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
+                    rows, forwards, body_a, body_b, bodies_32, n_rocks, machine, velocity, scratch
                 )
             else:
                 change = solve_machine_contacts(
-                    rows, backwards, body_a, body_b, bodies_32, n_rocks, machine, velocity
+                    rows, backwards, body_a, body_b, bodies_32, n_rocks, machine, velocity, scratch
                 )
                 for k in range(n - 1, -1, -1):
                     solve_batch(batches, k, bodies_32)
@@ -171,6 +185,14 @@ def solve_resting(
         iteration += 1
         if settled and iteration >= iterations:
             break
+        if momentum > 0.0 and iteration % 2 == 0 and iteration < max_iterations:
+            share = calc_share(iteration // 2 - 1, momentum)
+            share_32 = np.float32(share)
+            go_on(fields, every_batch, IMPULSE * LANES, last_impulses, share_32)
+            go_on(bodies_32, awake, 0, last_velocities, share_32)
+            go_on(rows, forwards, IMPULSE, last_machine_impulses, share)
+            go_on(machine.row_values, every_motor, ROW_IMPULSE, last_motors, share)
+            go_on(velocity.reshape(1, len(velocity)), one_body, 0, last_velocity, share)
     unpack_impulses(batches, n_batches, rows)
     for s in range(len(awake)):
         for d in range(6):

@@ -363,7 +363,7 @@ def solve_contact(row: Array, body_a: Array, body_b: Array) -> float:
     return change
 
 
-@allocating_kernel
+@kernel
 def solve_machine_contacts(
     rows: Array,
     order: Array,
@@ -373,12 +373,14 @@ def solve_machine_contacts(
     n_rocks: int,
     machine: MachineArrays,
     velocity: Array,
+    scratch: Array,
 ) -> float:
     """Update the machine's contacts in `order`; return the sum of the changes of their normal impulses.
 
     Contacts of one body in line share its spatial velocity; the whole machine is told when the body changes.
+    `scratch` is (3, 6).
     """
-    spatial, impulse, point = np.zeros(6), np.zeros(6), np.zeros(6)
+    spatial, impulse, point = scratch[0], scratch[1], scratch[2]
     current = -1
     changed = 0.0
     for c in range(len(order)):
@@ -610,7 +612,7 @@ def solve_impacts(
         row[COMPLIANCE] = 0.0
         chosen[n_chosen] = k
         n_chosen += 1
-    n_free = 0
+    n_free, scratch = 0, np.empty((3, 6))
     while n_free < n_chosen and body_b[chosen[n_free]] <= n_rocks:
         n_free += 1
     for _ in range(iterations):
@@ -618,7 +620,7 @@ def solve_impacts(
             k = chosen[c]
             solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]])
         solve_machine_contacts(
-            rows, chosen[n_free:n_chosen], body_a, body_b, bodies, n_rocks, machine, velocity
+            rows, chosen[n_free:n_chosen], body_a, body_b, bodies, n_rocks, machine, velocity, scratch
         )
     for c in range(n_chosen):
         k = chosen[c]
