@@ -60,11 +60,13 @@ BALANCE_WINDOW = 0.1
 # All are kept awake at least so long [s].
 BALANCE_LEAST = 0.3
 # Rocks that are set off by all being awake have so long to fall [s]; then all are kept awake again, at most so often,
-# and not when they were so small a share of the rocks that the others' balance stays.
+# until they are so small a share of the rocks that the others' balance stays; in a new pile until no rock has moved
+# farther than this [m].
 FALL_TIME = 5.0
 # A rock that no longer falls may go on so fast in its hole, on average [m/s].
 RATTLE_SPEED = 0.1
-BALANCE_ROUNDS = 5
+BALANCE_ROUNDS = 8
+LOOSE_DISTANCE = 0.01
 FEW_SHARE = 0.002
 
 
@@ -220,7 +222,7 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
     waiting = sample_rocks(number, recipe.rocks, shapes, rng)
     emitter = make_emitter(site, recipe.pile)
     pile, left = drop_rocks(
-        waiting, pile, shapes, recipe, emitter, rng, until_full=n is None, progress=progress
+        waiting, pile, shapes, recipe, emitter, rng, until_full=n is None, until_still=True, progress=progress
     )
     if n is not None and len(left):
         raise InputError(
@@ -256,6 +258,7 @@ def drop_rocks(
     *,
     until_full: bool = False,
     until_balanced: bool = False,
+    until_still: bool = False,
     site: Site | None = None,
     stage: str = "dropping rocks",
     progress: Progress | None = None,
@@ -276,6 +279,7 @@ def drop_rocks(
             still waits.
         until_balanced: at the end, keep all rocks awake no longer than until their forces balance; else for
             `pile.balance_time`.
+        until_still: and again, until none moves any more when all are awake.
         site: the surroundings, if not the recipe's.
         stage: what to call it in the progress.
         progress: called as things proceed.
@@ -307,7 +311,7 @@ def drop_rocks(
     if not resting:
         raise SimulationFailure(f"the pile did not come to rest within {recipe.pile.max_time:g} s")
     if pile.contacts is not None:
-        pile = _balance(pile, shapes, recipe, site, until_balanced)
+        pile = _balance(pile, shapes, recipe, site, until_balanced, until_still)
     return replace(pile, V_WRs=np.zeros_like(pile.V_WRs)), waiting
 
 
@@ -317,6 +321,7 @@ def _balance(
     recipe: PileRecipe,
     site: Site | None,
     until_balanced: bool,
+    until_still: bool,
 ) -> PileState:
     """Return a settled pile with its contact forces in balance with the weights, and its rocks at rest.
 
@@ -345,6 +350,7 @@ def _balance(
 
     few = FEW_SHARE * len(pile)
     for _ in range(BALANCE_ROUNDS):
+        before = pile
         if until_balanced:
             # A rock that only leans shows it only after a while.
             first = min(BALANCE_LEAST, recipe.pile.balance_time)
@@ -363,7 +369,8 @@ def _balance(
             pile, _ = settle(
                 pile, shapes, recipe, FALL_TIME, site=site, until=lambda pile: not find_fast(pile).any()
             )
-        if fast.sum() <= few:
+        moved = np.linalg.norm(pile.p_WRs - before.p_WRs, axis=1)
+        if fast.sum() <= few and (not until_still or moved.max(initial=0.0) < LOOSE_DISTANCE):
             break
     return pile
 
