@@ -1,4 +1,4 @@
-"""Makes default.npz beside this file, the default scenario's pile: `python piles/make_default.py` (a minute)."""
+"""Makes default.npz beside this file, the default scenario's pile: `python piles/make_default.py` (two minutes)."""
 
 from pathlib import Path
 
