@@ -34,6 +34,14 @@ class Lanes:
         return cls(builder, ir.Constant(_VECTOR, [number] * LANES))
 
     @classmethod
+    def spread(cls, builder: Any, number: Any) -> Lanes:
+        """Return a number known only when the kernel runs, in all lanes."""
+        empty = ir.Constant(_VECTOR, ir.Undefined)
+        one = builder.insert_element(empty, number, ir.Constant(ir.IntType(32), 0))
+        mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+        return cls(builder, builder.shuffle_vector(one, empty, mask))
+
+    @classmethod
     def load(cls, builder: Any, pointer: Any) -> Lanes:
         """Return the eight numbers at a pointer to a number."""
         address = builder.bitcast(pointer, _VECTOR.as_pointer())

@@ -15,7 +15,7 @@ from drakerock.dynamics.nonsmooth.batches import (
 from drakerock.dynamics.nonsmooth.compiling import Array, allocating_kernel, kernel
 from drakerock.dynamics.nonsmooth.contacts import IMPULSE
 from drakerock.dynamics.nonsmooth.lanes import LANES
-from drakerock.dynamics.nonsmooth.momentum import calc_share, go_on
+from drakerock.dynamics.nonsmooth.momentum import calc_share, go_on, go_on_in_lanes
 from drakerock.dynamics.nonsmooth.solver import (
     INVERSE_INERTIA,
     ROW_IMPULSE,
@@ -155,7 +155,8 @@ def solve_resting(
     every_batch, every_motor = np.arange(n_batches), np.arange(len(machine.row_values))
     one_body, fields = np.zeros(1, np.int64), batches.fields.reshape(len(batches.fields), FIELDS * LANES)
     last_impulses = np.zeros((n_batches, 3 * LANES), np.float32)
-    last_velocities = np.zeros((len(awake), 6), np.float32)
+    # With two columns that do not change, so that a rock is one vector.
+    last_velocities = np.zeros((len(awake), LANES), np.float32)
     last_machine_impulses = np.zeros((n_rows - n_free, 3))
     last_motors, last_velocity = np.zeros((len(every_motor), 1)), np.zeros((1, len(velocity)))
     changed = 0.0
@@ -187,9 +188,8 @@ def solve_resting(
             break
         if momentum > 0.0 and iteration % 2 == 0 and iteration < max_iterations:
             share = calc_share(iteration // 2 - 1, momentum)
-            share_32 = np.float32(share)
-            go_on(fields, every_batch, IMPULSE * LANES, last_impulses, share_32)
-            go_on(bodies_32, awake, 0, last_velocities, share_32)
+            go_on_in_lanes(fields, every_batch, IMPULSE * LANES, 3, last_impulses, share)
+            go_on_in_lanes(bodies_32, awake, 0, 1, last_velocities, share)
             go_on(rows, forwards, IMPULSE, last_machine_impulses, share)
             go_on(machine.row_values, every_motor, ROW_IMPULSE, last_motors, share)
             go_on(velocity.reshape(1, len(velocity)), one_body, 0, last_velocity, share)

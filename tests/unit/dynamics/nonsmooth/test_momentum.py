@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from drakerock.dynamics.nonsmooth.momentum import calc_share, go_on
+from drakerock.dynamics.nonsmooth.momentum import calc_share, go_on, go_on_in_lanes
 
 
 def test_share_grows_to_its_limit():
@@ -22,6 +22,18 @@ def test_chosen_columns_of_chosen_rows_go_on(kind):
     # Nothing has changed since: what was added the last time is what changes now.
     go_on(values, np.array([3, 1]), 2, last, kind(0.5))
     np.testing.assert_allclose(values[3, 2], expected[3, 2] + 0.5 * (expected[3, 2] - before[3, 2]))
+
+
+def test_eight_at_a_time_is_the_same():
+    rng = np.random.default_rng(1)
+    values, last = rng.normal(size=(9, 40)).astype(np.float32), rng.normal(size=(4, 16)).astype(np.float32)
+    rows = np.array([7, 0, 3, 8])
+    one, two = (values.copy(), last.copy()), (values.copy(), last.copy())
+    go_on(one[0], rows, 5, one[1], np.float32(0.7))
+    go_on_in_lanes(two[0], rows, 5, 2, two[1], 0.7)
+    np.testing.assert_array_equal(two[0], one[0])
+    np.testing.assert_array_equal(two[1], one[1])
+    assert not np.array_equal(one[0], values)
 
 
 @pytest.mark.parametrize("slow", [0.5, 0.9, 0.99])
