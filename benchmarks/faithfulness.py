@@ -3,7 +3,7 @@
     nice python benchmarks/faithfulness.py run 300 --seeds 40 --out build/faithfulness
     nice python benchmarks/faithfulness.py cycles 300 --seeds 40 --out build/faithfulness
     nice python benchmarks/faithfulness.py states 300 --seeds 8 --out build/faithfulness
-    nice python benchmarks/faithfulness.py held full --seeds 3 --variants rest rest-0.1 --out build/faithfulness
+    nice python benchmarks/faithfulness.py held full --seeds 3 --variants rest rest-0.04 --out build/faithfulness
     python benchmarks/faithfulness.py table --out build/faithfulness
 
 `run` digs by fixed motor rates; `cycles` plans and drives whole loading cycles of random strategies, which gives
@@ -73,7 +73,7 @@ VARIANTS: dict[str, tuple[dict[str, object], float]] = {
     "none-repeat": ({"reduction": "none", "iterations": 101}, TIME_STEP),
     "twice-iterations": ({"reduction": "none", "iterations": 200, "tolerance": 1.5e-4}, TIME_STEP),
     "half-step": ({"reduction": "none"}, 0.5 * TIME_STEP),
-    "rest-0.1": ({"reduction": "rest", "rest": {"time": 0.1, "displacement": 1e-3}}, TIME_STEP),
+    "rest-0.04": ({"reduction": "rest", "rest": {"time": 0.04, "displacement": 1e-4}}, TIME_STEP),
     "rest-0.02": ({"reduction": "rest", "rest": {"time": 0.02, "displacement": 1e-4}}, TIME_STEP),
     "share-0.05": ({"reduction": "rest", "rest": {"wake_share": 0.05}}, TIME_STEP),
     "share-0.2": ({"reduction": "rest", "rest": {"wake_share": 0.2}}, TIME_STEP),

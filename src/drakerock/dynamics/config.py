@@ -17,8 +17,8 @@ class RestConfig(Config):
 
     displacement: Annotated[
         float, Field(gt=0, description="a rock rests when it moved less than this [m] ...")
-    ] = 0.0001
-    time: Annotated[float, Field(gt=0, description="... within this time [s]")] = 0.04
+    ] = 0.001
+    time: Annotated[float, Field(gt=0, description="... within this time [s]")] = 0.1
     speed: Annotated[float, Field(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
     wake_load: Annotated[
         float,
