@@ -54,7 +54,7 @@ def make_engine(pile: PileState, site: SiteConfig = SITE, **settings: object) ->
 
 
 def get_pile() -> PileState:
-    """Return the default scenario's pile; made on first use (a minute) if it is not the shipped one."""
+    """Return the default scenario's pile; made on first use (minutes) if it is not the shipped one."""
     return fetch_pile(make_recipe(Scenario()))[0]
 
 

@@ -1,4 +1,4 @@
-"""Makes default.npz beside this file, the default scenario's pile: `python piles/make_default.py` (two minutes)."""
+"""Makes default.npz beside this file, the default scenario's pile: `python piles/make_default.py` (three minutes)."""
 
 from pathlib import Path
 
