@@ -327,7 +327,8 @@ def _balance(
 
     Rocks come to rest one after the other, each with the forces of that moment, which later rest changes. So all
     are kept awake for a while at the end; with `until_balanced` no longer than until the forces balance. A rock that
-    this sets off falls and comes to rest before all are kept awake again.
+    this sets off falls and comes to rest before all are kept awake again; with `until_still` that goes on until no
+    rock moves any more while all are awake.
     """
     nonsmooth = recipe.dynamics.nonsmooth.model_copy(update={"reduction": "none"})
     dynamics = recipe.dynamics.model_copy(update={"nonsmooth": nonsmooth})

@@ -188,8 +188,8 @@ def solve_resting(
             break
         if momentum > 0.0 and iteration % 2 == 0 and iteration < max_iterations:
             share = calc_share(iteration // 2 - 1, momentum)
-            go_on_in_lanes(fields, every_batch, IMPULSE * LANES, 3, last_impulses, share)
-            go_on_in_lanes(bodies_32, awake, 0, 1, last_velocities, share)
+            go_on_in_lanes(fields, every_batch, IMPULSE * LANES, last_impulses, share)
+            go_on_in_lanes(bodies_32, awake, 0, last_velocities, share)
             go_on(rows, forwards, IMPULSE, last_machine_impulses, share)
             go_on(machine.row_values, every_motor, ROW_IMPULSE, last_motors, share)
             go_on(velocity.reshape(1, len(velocity)), one_body, 0, last_velocity, share)

@@ -30,7 +30,7 @@ def test_eight_at_a_time_is_the_same():
     rows = np.array([7, 0, 3, 8])
     one, two = (values.copy(), last.copy()), (values.copy(), last.copy())
     go_on(one[0], rows, 5, one[1], np.float32(0.7))
-    go_on_in_lanes(two[0], rows, 5, 2, two[1], 0.7)
+    go_on_in_lanes(two[0], rows, 5, two[1], 0.7)
     np.testing.assert_array_equal(two[0], one[0])
     np.testing.assert_array_equal(two[1], one[1])
     assert not np.array_equal(one[0], values)

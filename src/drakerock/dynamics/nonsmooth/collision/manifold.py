@@ -42,22 +42,22 @@ def make_manifold_workspace() -> tuple[Array, Array, Array, Array]:
 
 
 @kernel
+def _calc_cosine(normals: Array, face: int, x: float, y: float, z: float) -> float:
+    return float(normals[face, 0] * x + normals[face, 1] * y + normals[face, 2] * z)
+
+
+@kernel
 def _find_face(shapes: ConvexShapes, shape: int, x: float, y: float, z: float) -> tuple[int, float]:
     """Return the face of a core whose normal is nearest to (x, y, z), and the cosine between them."""
     best = -2.0
     index = shapes.face_start[shape]
     normals = shapes.face_normals
     for face in range(shapes.face_start[shape], shapes.face_start[shape + 1]):
-        cosine = normals[face, 0] * x + normals[face, 1] * y + normals[face, 2] * z
+        cosine = _calc_cosine(normals, face, x, y, z)
         if cosine > best:
             best = cosine
             index = face
     return index, best
-
-
-@kernel
-def _is_aligned(normals: Array, face: int, x: float, y: float, z: float, min_cosine: float) -> bool:
-    return bool(normals[face, 0] * x + normals[face, 1] * y + normals[face, 2] * z >= min_cosine)
 
 
 @kernel
@@ -206,7 +206,7 @@ def make_manifold(
     normals, near, sides = shapes.face_normals, shapes.near_faces, shapes.side_normals
     n_candidates = 0
     for j in range(shapes.near_start[incident], shapes.near_start[incident + 1]):
-        if near[j] != incident and not _is_aligned(normals, near[j], mx, my, mz, min_cosine):
+        if near[j] != incident and _calc_cosine(normals, near[j], mx, my, mz) < min_cosine:
             continue
         first = shapes.face_vertex_start[near[j]]
         n_corners = shapes.face_vertex_start[near[j] + 1] - first
@@ -216,7 +216,7 @@ def make_manifold(
                 ref_r, x + ix - rx, y + iy - ry, z + iz - rz
             )
         for i in range(shapes.near_start[reference], shapes.near_start[reference + 1]):
-            if near[i] != reference and not _is_aligned(normals, near[i], lx, ly, lz, min_cosine):
+            if near[i] != reference and _calc_cosine(normals, near[i], lx, ly, lz) < min_cosine:
                 continue
             # In the reference's frame. Gaps are measured along the pair's normal, to the reference's plane.
             fx, fy, fz = normals[near[i], 0], normals[near[i], 1], normals[near[i], 2]
