@@ -3,7 +3,7 @@
     nice python benchmarks/faithfulness.py run 300 --seeds 40 --out build/faithfulness
     nice python benchmarks/faithfulness.py cycles 300 --seeds 40 --out build/faithfulness
     nice python benchmarks/faithfulness.py states 300 --seeds 8 --out build/faithfulness
-    nice python benchmarks/faithfulness.py held full --seeds 3 --variants rest rest-0.04 --out build/faithfulness
+    nice python benchmarks/faithfulness.py held full --seeds 3 --variants rest rest-alone --out build/faithfulness
     python benchmarks/faithfulness.py table --out build/faithfulness
 
 `run` digs by fixed motor rates; `cycles` plans and drives whole loading cycles of random strategies, which gives
@@ -77,9 +77,13 @@ VARIANTS: dict[str, tuple[dict[str, object], float]] = {
         TIME_STEP,
     ),
     "half-step": ({"reduction": "none"}, 0.5 * TIME_STEP),
-    "rest-0.04": ({"reduction": "rest", "rest": {"time": 0.04, "displacement": 1e-4}}, TIME_STEP),
-    "share-0.05": ({"reduction": "rest", "rest": {"wake_share": 0.05}}, TIME_STEP),
-    "share-0.2": ({"reduction": "rest", "rest": {"wake_share": 0.2}}, TIME_STEP),
+    # Each rock for itself: what rests and wakes does not ask whether a neighbour moves, and nothing is looked at again.
+    "rest-alone": (
+        {"reduction": "rest", "rest": {"mover_speed": 1e9, "wake_share": 0.1, "recheck_period": 1e9}},
+        TIME_STEP,
+    ),
+    "rest-no-recheck": ({"reduction": "rest", "rest": {"recheck_period": 1e9}}, TIME_STEP),
+    "rest-movers-0.003": ({"reduction": "rest", "rest": {"mover_speed": 0.003}}, TIME_STEP),
     "plain-50": (
         {"reduction": "none", "iterations": 50, "tolerance": 1.0, "momentum": 0.0, "machine_sweeps": 3},
         TIME_STEP,

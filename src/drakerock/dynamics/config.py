@@ -20,6 +20,9 @@ class RestConfig(Config):
     ] = 0.001
     time: Annotated[float, Field(gt=0, description="... within this time [s]")] = 0.1
     speed: Annotated[float, Field(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
+    mover_speed: Annotated[
+        float, Field(gt=0, description="... and leans on none that is faster than this, a mover [m/s]")
+    ] = 0.01
     wake_load: Annotated[
         float,
         Field(
@@ -29,7 +32,14 @@ class RestConfig(Config):
     ] = 0.3
     wake_share: Annotated[
         float, Field(ge=0, description="... and of half the sum of their sizes, the pressure on it")
+    ] = 0.3
+    wake_near_movers: Annotated[
+        float, Field(ge=0, le=1, description="... both times this, if it leans on a mover")
     ] = 0.1
+    recheck_period: Annotated[
+        float,
+        Field(gt=0, description="this often all that have moved since the start are woken together [s]"),
+    ] = 1.0
     wake_steps: Annotated[int, Field(ge=1, description="... for this many steps on end")] = 1
     sensor_length: Annotated[
         float, Field(ge=0, le=10, description="rocks this far in front of the bucket are awake [m]")
@@ -115,7 +125,7 @@ class NonsmoothConfig(Config):
             gt=0,
             description="a step with more is flagged and solved again with more iterations, then fails",
         ),
-    ] = 0.2
+    ] = 0.05
     max_penetration: Annotated[
         float,
         Field(

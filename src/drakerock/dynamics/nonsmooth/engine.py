@@ -37,9 +37,9 @@ GRAVITY = 9.81
 # How far outside the site's box a rock still counts as inside [m].
 SITE_MARGIN = 0.5
 # Sweeps that the machine's forces ask for are at most this many times the iterations. A step that failed is solved
-# again with as many, from a cold start; one that begins with an overlap beyond this share of the bound has them at
-# once. A light rock that the machine presses into a jammed pile passes on little of the machine's momentum per
-# iteration, and is squeezed meanwhile.
+# again with as many and without momentum, from a cold start if need be; one that begins with an overlap beyond this
+# share of the bound has them at once. A light rock that the machine presses into a jammed pile passes on little of the
+# machine's momentum per iteration, and is squeezed meanwhile.
 RETRY_FACTOR = 4
 DEEP_SHARE = 0.375
 
@@ -88,6 +88,7 @@ class RockArrays:
         velocities: (n, 6) angular, translational in W.
         book: (n, reduction.BOOK_WIDTH) status and bookkeeping of the reduction.
         memory: (m, contacts.MEMORY_WIDTH) float32, loaded contact points; m changes from step to step.
+        steps: how many have been taken.
     """
 
     quaternions: Array
@@ -95,6 +96,7 @@ class RockArrays:
     velocities: Array
     book: Array
     memory: NDArray[np.float32]
+    steps: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,6 +262,7 @@ class NonsmoothEngine:
         self._statistics = np.zeros(4, np.int64)
         self._narrow_workspace = narrow_phase.make_workspace()
         self._sums = np.zeros((n, 3))
+        self._by_movers = np.zeros(n, np.bool_)
         self._cell_start = np.zeros(2, np.int64)
         self._allocate_pairs(20 * n + 256)
         self._allocate_rows(6 * n + 256)
@@ -412,17 +415,19 @@ class NonsmoothEngine:
 
         Raises:
             SimulationFailure: the result is not finite or has not converged, also when solved again with
-                `RETRY_FACTOR` times the iterations.
+                `RETRY_FACTOR` times the iterations and without momentum.
         """
         for name in ("positions", "quaternions", "velocities"):
             if not motion.are_finite(getattr(arrays, name)):
                 raise SimulationFailure(f"rocks: {name} that are not finite")
-        iterations = self.config.iterations
+        iterations, momentum = self.config.iterations, self.config.momentum
         room = room or self.make_room()
-        new, report = self._try_step(arrays, machine, room, iterations, warm=True)
+        new, report = self._try_step(arrays, machine, room, iterations, momentum, warm=True)
         if new is not None and report is not None and report.residual <= self.config.max_residual:
             return new, report
-        again, better = self._try_step(arrays, machine, room, RETRY_FACTOR * iterations, warm=new is not None)
+        again, better = self._try_step(
+            arrays, machine, room, RETRY_FACTOR * iterations, 0.0, warm=new is not None
+        )
         if again is None or better is None:
             raise SimulationFailure("rocks: the contact solve gave values that are not finite")
         if better.residual > self.config.max_residual:
@@ -433,14 +438,23 @@ class NonsmoothEngine:
         return again, _mark_redone(better)
 
     def _try_step(
-        self, arrays: RockArrays, machine: MachineStep, room: RockArrays, iterations: int, warm: bool
+        self,
+        arrays: RockArrays,
+        machine: MachineStep,
+        room: RockArrays,
+        iterations: int,
+        momentum: float,
+        warm: bool,
     ) -> tuple[RockArrays, StepReport] | tuple[None, None]:
         config, n, dt = self.config, self.n_rocks, self.time_step
-        new = replace(room)
+        new = replace(room, steps=arrays.steps + 1)
         book, memory = new.book, arrays.memory
         book[:] = arrays.book
         n_woken = 0
         if config.reduction == "rest":
+            reduction.mark_by_movers(
+                book, arrays.velocities, memory, config.rest.mover_speed, self._by_movers
+            )
             n_woken = reduction.wake(
                 book,
                 arrays.positions,
@@ -448,10 +462,14 @@ class NonsmoothEngine:
                 self.mass,
                 memory,
                 machine.sensors,
+                self._by_movers,
                 config.rest.wake_load * self.gravity * dt,
                 config.rest.wake_share,
+                config.rest.wake_near_movers,
                 config.rest.wake_steps,
             )
+            if new.steps % max(round(config.rest.recheck_period / dt), 1) == 0:
+                n_woken += reduction.wake_moved(book, arrays.positions)
         else:
             reduction.wake_all(book, arrays.positions)
         status = book[:, reduction.STATUS].astype(np.int64)
@@ -490,7 +508,7 @@ class NonsmoothEngine:
         residual, n_sweeps = resting.solve_resting(
             rows, n_rows, body_a, body_b, awake, self._bodies, n, machine.arrays, velocity,
             iterations, max(iterations, RETRY_FACTOR * config.iterations), config.tolerance,
-            config.machine_sweeps, config.momentum, self._batches, self._bodies_32, self._marks,
+            config.machine_sweeps, momentum, self._batches, self._bodies_32, self._marks,
         )  # fmt: skip
 
         new.quaternions[:] = arrays.quaternions
@@ -515,8 +533,12 @@ class NonsmoothEngine:
             self._row_rock, self._rotations, new.memory,
         )  # fmt: skip
         new.memory = new.memory[:n_memory]
+        if config.reduction == "rest":
+            reduction.mark_by_movers(
+                book, new.velocities, new.memory, config.rest.mover_speed, self._by_movers
+            )
         n_rested, n_lost = reduction.rest(
-            book, new.positions, new.velocities, self.radius, machine.sensors, dt,
+            book, new.positions, new.velocities, self.radius, machine.sensors, self._by_movers, dt,
             config.rest.displacement, config.rest.time, config.rest.speed, self._lower_site, self._upper_site,
             config.reduction == "rest",
         )  # fmt: skip

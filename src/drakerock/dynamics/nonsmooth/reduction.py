@@ -1,8 +1,15 @@
 """Model reduction: rocks that come to rest, and what wakes them.
 
 A resting rock stays in the force network: the impulses of its contacts are kept, contacts with awake
-neighbours are solved against it as against solid ground. It is woken by a lasting change of its load, or by
-the refinement sensor in front of the bucket.
+neighbours are solved against it as against solid ground. It is woken by a change of its load, or by the refinement
+sensor in front of the bucket.
+
+Rocks that lean on one that moves (a mover) are a case of their own. Single rocks that rest in a slope that slides
+slowly are posts that brake it, and what a mover does to its neighbours goes on in one direction, while changes
+elsewhere are the force network's unrest. So they do not rest, and a smaller change wakes them.
+
+Many changes, each too small to wake a rock, may add up to a slope that would slide. So from time to time all that have
+moved are woken together.
 """
 
 from __future__ import annotations
@@ -11,7 +18,7 @@ import numpy as np
 
 from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, LOST, RESTING
 from drakerock.dynamics.nonsmooth.compiling import Array, allocating_kernel, kernel
-from drakerock.dynamics.nonsmooth.contacts import sum_impulses, sum_pressures
+from drakerock.dynamics.nonsmooth.contacts import MEMORY_FIRST, MEMORY_SECOND, sum_impulses, sum_pressures
 
 # Columns of a rock's bookkeeping (all stored in the context).
 STATUS = 0
@@ -21,7 +28,9 @@ ANCHOR = 2  # 2..4 where the rock was when its time at rest began
 # of a resting rock
 CHANGED_STEPS = 1
 REFERENCE = 2  # 2..4 sum of its contact impulses when it came to rest [N s]
-BOOK_WIDTH = 5
+# of both
+MOVED = 5  # 1: it has moved since the start
+BOOK_WIDTH = 6
 
 # In CHANGED_STEPS: the rock has just come to rest, its reference is not set yet.
 NEW = -1.0
@@ -44,6 +53,36 @@ def is_sensed(x: float, y: float, z: float, radius: float, sensors: Array) -> bo
     return False
 
 
+@kernel
+def mark_by_movers(book: Array, velocities: Array, memory: Array, mover_speed: float, marks: Array) -> None:
+    """Mark the rocks that share a loaded contact with a mover.
+
+    Args:
+        book: (n, BOOK_WIDTH).
+        velocities: (n, 6).
+        memory: loaded contact points, see `contacts`.
+        mover_speed: awake rocks that are faster are movers [m/s].
+        marks: (n,) bool, set.
+    """
+    n = len(book)
+    marks[:] = False
+    for row in range(len(memory)):
+        a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
+        if b < n:
+            if _moves(book, velocities, a, mover_speed):
+                marks[b] = True
+            if _moves(book, velocities, b, mover_speed):
+                marks[a] = True
+
+
+@kernel
+def _moves(book: Array, velocities: Array, i: int, speed: float) -> bool:
+    if book[i, STATUS] != AWAKE:
+        return False
+    x, y, z = velocities[i, 3], velocities[i, 4], velocities[i, 5]
+    return bool(x * x + y * y + z * z > speed * speed)
+
+
 @allocating_kernel
 def wake(
     book: Array,
@@ -52,8 +91,10 @@ def wake(
     mass: Array,
     memory: Array,
     sensors: Array,
+    by_movers: Array,
     load: float,
     share: float,
+    near: float,
     steps: int,
 ) -> int:
     """Wake resting rocks.
@@ -68,8 +109,10 @@ def wake(
         mass: (n,) [kg].
         memory: loaded contact points, see `contacts`.
         sensors: (k, 18) see `is_sensed`.
+        by_movers: (n,) see `mark_by_movers`.
         load: change of the impulses' sum per mass above which a rock wakes, if it is above ... [m/s]
         share: ... this multiple of half the sum of their sizes, the pressure, too.
+        near: both are multiplied by this for rocks that lean on a mover.
         steps: for how many steps on end.
 
     Returns:
@@ -85,14 +128,16 @@ def wake(
             change2[i] = 0.0
             for d in range(3):
                 change2[i] += (sums[i, d] - book[i, REFERENCE + d]) ** 2
-            changed[i] = change2[i] > (load * mass[i]) ** 2
+            limit = load * mass[i] * (near if by_movers[i] else 1.0)
+            changed[i] = change2[i] > limit * limit
     if changed.any():
         sum_pressures(memory, n, changed, pressures)
     n_woken = 0
     for i in range(n):
         if book[i, STATUS] != RESTING:
             continue
-        if changed[i] and change2[i] > (share * pressures[i]) ** 2:
+        limit = share * pressures[i] * (near if by_movers[i] else 1.0)
+        if changed[i] and change2[i] > limit * limit:
             book[i, CHANGED_STEPS] += 1.0
         else:
             book[i, CHANGED_STEPS] = 0.0
@@ -114,6 +159,17 @@ def wake_rock(book: Array, positions: Array, i: int) -> None:
 
 
 @kernel
+def wake_moved(book: Array, positions: Array) -> int:
+    """Wake the resting rocks that have moved since the start; return their number."""
+    n_woken = 0
+    for i in range(len(book)):
+        if book[i, STATUS] == RESTING and book[i, MOVED] == 1.0:
+            wake_rock(book, positions, i)
+            n_woken += 1
+    return n_woken
+
+
+@kernel
 def wake_all(book: Array, positions: Array) -> None:
     """Wake all resting rocks (`reduction: none`)."""
     for i in range(len(book)):
@@ -128,6 +184,7 @@ def rest(
     velocities: Array,
     radius: Array,
     sensors: Array,
+    by_movers: Array,
     time_step: float,
     displacement: float,
     time: float,
@@ -139,7 +196,7 @@ def rest(
     """Let awake rocks come to rest, and take those that left the site out.
 
     Args:
-        book, positions, radius, sensors: as for `wake`.
+        book, positions, radius, sensors, by_movers: as for `wake`.
         velocities: (n, 6) changed: zero for rocks that come to rest.
         time_step: [s].
         displacement, time, speed: see `RestConfig`.
@@ -171,6 +228,7 @@ def rest(
             continue
         if moved2 > displacement * displacement:
             book[i, STILL_TIME] = 0.0
+            book[i, MOVED] = 1.0
             for d in range(3):
                 book[i, ANCHOR + d] = positions[i, d]
         else:
@@ -178,6 +236,7 @@ def rest(
         if (
             book[i, STILL_TIME] >= time
             and fastest < speed
+            and not by_movers[i]
             and not is_sensed(positions[i, 0], positions[i, 1], positions[i, 2], radius[i], sensors)
         ):
             book[i, STATUS] = RESTING

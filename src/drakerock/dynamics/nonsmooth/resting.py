@@ -27,6 +27,8 @@ from drakerock.dynamics.nonsmooth.solver import (
 
 # Contacts of rocks that are at most this many rocks away from one that touches the machine are its neighbourhood.
 NEIGHBOURHOOD = 2
+# One in so many of the iterations is without momentum, the last ones.
+PLAIN = 10
 
 
 @kernel
@@ -116,7 +118,8 @@ def solve_resting(
     They go on until the forces on the machine have settled, which takes longest where it presses on a jam. Each is
     followed by `machine_sweeps` over the machine's own rows, its contacts and their neighbourhood. A light rock that
     the machine presses on others passes on little of the machine's momentum per sweep. After every second one all are
-    continued on their way, see `momentum`.
+    continued on their way, see `momentum`; but for the last tenth of `iterations`, in which what goes to and fro with
+    momentum comes to an end.
 
     The sweeps over the rocks run in single precision; the velocities are then made anew from the impulses in
     double precision, so that momentum is kept to rounding.
@@ -159,6 +162,7 @@ def solve_resting(
     last_velocities = np.zeros((len(awake), LANES), np.float32)
     last_machine_impulses = np.zeros((n_rows - n_free, 3))
     last_motors, last_velocity = np.zeros((len(every_motor), 1)), np.zeros((1, len(velocity)))
+    first_plain = iterations - iterations // PLAIN
     changed = 0.0
     iteration = 0
     while iteration < max_iterations:
@@ -186,8 +190,11 @@ def solve_resting(
         iteration += 1
         if settled and iteration >= iterations:
             break
-        if momentum > 0.0 and iteration % 2 == 0 and iteration < max_iterations:
-            share = calc_share(iteration // 2 - 1, momentum)
+        closing = first_plain <= iteration < iterations
+        if momentum > 0.0 and iteration % 2 == 0 and iteration < max_iterations and not closing:
+            # Just after plain sweeps what two have changed is not known.
+            goes_on = iteration < iterations or iteration >= iterations + 2
+            share = calc_share(iteration // 2 - 1, momentum) if goes_on else 0.0
             go_on_in_lanes(fields, every_batch, IMPULSE * LANES, last_impulses, share)
             go_on_in_lanes(bodies_32, awake, 0, last_velocities, share)
             go_on(rows, forwards, IMPULSE, last_machine_impulses, share)

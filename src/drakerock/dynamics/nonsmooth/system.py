@@ -156,6 +156,7 @@ class NonsmoothRocks(LeafSystem):
             state["velocities"].reshape(n, 6),
             state["book"].reshape(n, reduction.BOOK_WIDTH),
             state["memory"].view(np.float32).reshape(-1, contacts.MEMORY_WIDTH)[: int(state["counts"][0])],
+            int(state["counts"][1]),
         )
 
     def _write(self, discrete: DiscreteValues, values: dict[str, Array]) -> None:
@@ -232,7 +233,7 @@ def _flatten(arrays: RockArrays, report: Array | None = None) -> dict[str, Array
         "velocities": arrays.velocities.reshape(-1),
         "book": arrays.book.reshape(-1),
         "memory": arrays.memory.reshape(-1).view(np.float64),  # bits, two numbers in one
-        "counts": np.array([float(len(arrays.memory))]),
+        "counts": np.array([float(len(arrays.memory)), float(arrays.steps)]),
         "report": np.zeros(len(ROCK_SUMMARY) + 6) if report is None else report,
     }
 

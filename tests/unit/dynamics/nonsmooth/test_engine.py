@@ -18,6 +18,7 @@ from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.nonsmooth import contacts, motion, reduction, solver
 from drakerock.dynamics.nonsmooth import engine as engine_module
 from drakerock.dynamics.nonsmooth.collision import gjk
+from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, RESTING
 from drakerock.dynamics.nonsmooth.engine import DEEP_SHARE, MachinePiece, MachineStep, make_machineless_step
 from drakerock.dynamics.nonsmooth.system import NonsmoothRocks
 from drakerock.errors import InputError, SimulationFailure
@@ -166,7 +167,8 @@ def settle(n=25, seed=0):
         quaternions=[draw_quaternion(rng) for _ in range(n)],
     )
     engine = make_engine(pile, SHAPES, config=NonsmoothConfig(), site=make_plane_site(planes=5))
-    arrays, _ = run(engine, engine.make_arrays(pile), 4.0)
+    # Half a second after all that have moved were woken together.
+    arrays, _ = run(engine, engine.make_arrays(pile), 4.5)
     return engine, arrays
 
 
@@ -243,13 +245,16 @@ def test_a_step_into_given_room_is_the_same_step():
     engine, arrays = settle()
     arrays.velocities[:, 5] += 0.2
     arrays.book[:, reduction.STATUS] = 0
-    before = replace(arrays, **{name: value.copy() for name, value in vars(arrays).items()})
+    groups = {name: value for name, value in vars(arrays).items() if name != "steps"}
+    before = replace(arrays, **{name: value.copy() for name, value in groups.items()})
     room = engine.make_room()
-    for array in vars(room).values():
-        array[:] = np.nan
+    for name in groups:
+        getattr(room, name)[:] = np.nan
     expected, _ = engine.advance(arrays)
     result, _ = engine.step(arrays, make_machineless_step(), room)
-    for name, value in vars(result).items():
+    assert result.steps == expected.steps == arrays.steps + 1
+    for name in groups:
+        value = getattr(result, name)
         assert np.array_equal(value, getattr(expected, name)), name
         assert np.shares_memory(value, getattr(room, name))
         assert np.array_equal(getattr(arrays, name), getattr(before, name))
@@ -316,8 +321,9 @@ def test_the_sensor_wakes_what_is_in_its_box():
     contacts.sum_impulses(arrays.memory, len(book), sums)
     book[:, reduction.REFERENCE : reduction.REFERENCE + 3] = sums
     box = np.concatenate([np.eye(3).reshape(-1), np.zeros(3), [-10, -10, -1], [0.0, 10, 10]])
+    alone = np.zeros(len(book), np.bool_)
     n = reduction.wake(
-        book, arrays.positions, engine.radius, engine.mass, arrays.memory, box[None], 0.1, 0.1, 3
+        book, arrays.positions, engine.radius, engine.mass, arrays.memory, box[None], alone, 0.1, 0.1, 0.1, 3
     )
     inside = arrays.positions[:, 0] < engine.radius
     assert n == inside.sum()
@@ -354,8 +360,9 @@ def test_a_step_that_does_not_converge_is_redone_then_fails(fails):
     shapes = [make_box(0.8, 0.8, 0.5)]
     config = NonsmoothConfig(reduction="none", iterations=4, max_residual=1e9)
     residuals = []
-    for iterations in (4, 16):
-        engine = make_engine(pile, shapes, config=config.model_copy(update={"iterations": iterations}))
+    for iterations, momentum in ((4, config.momentum), (16, 0.0)):
+        update = {"iterations": iterations, "momentum": momentum}
+        engine = make_engine(pile, shapes, config=config.model_copy(update=update))
         residuals.append(engine.advance(engine.make_arrays(pile))[1].residual)
     assert residuals[0] > 2 * residuals[1] > 0
     bound = 0.9 * residuals[1] if fails else 1.1 * residuals[1]
@@ -368,6 +375,28 @@ def test_a_step_that_does_not_converge_is_redone_then_fails(fails):
         assert report.redone
         assert report.flagged
         assert report.residual == residuals[1]
+
+
+def test_momentum_does_not_leave_a_sliding_rock_in_a_cycle():
+    """A rock slides along another and the floor: with momentum to the last, impulses go to and fro for ever (0.4)."""
+    pile = make_pile(
+        [[-2.17279, -1.23646, 0.21966], [-2.51947, -0.66742, 0.2912]],
+        shape=[2, 0],
+        size=[0.6, 0.6],
+        quaternions=[[-0.0506, 0.1475, -0.19773, -0.96778], [-0.11812, 0.28799, 0.40947, 0.85758]],
+        fixed=[True, False],
+    )
+    velocities = np.zeros((2, 6))
+    velocities[1] = [0.85403, 0.40902, -0.00076, 0.11915, -0.24943, -0.07278]
+    pile = replace(pile, V_WRs=velocities)
+    ends = {}
+    for momentum in (0.8, 0.0):
+        engine = make_engine(pile, SHAPES, config=NonsmoothConfig(reduction="none", momentum=momentum))
+        arrays, report = engine.advance(engine.make_arrays(pile))
+        assert report.residual < 0.05
+        assert not report.redone
+        ends[momentum] = arrays.velocities[1]
+    np.testing.assert_allclose(ends[0.8], ends[0.0], atol=0.01)
 
 
 def test_a_light_rock_between_a_heavy_one_and_the_floor_is_not_squeezed(monkeypatch):
@@ -606,5 +635,51 @@ def test_a_rock_under_pressure_wakes_by_a_share_of_it(squeeze, wakes):
     memory[:, contacts.MEMORY_IMPULSE] = [0.0, squeeze * weight, -squeeze * weight]
     memory[0, contacts.MEMORY_IMPULSE + 2] = -0.69 * weight
     nowhere = np.zeros((0, 18))
-    n = reduction.wake(book, np.zeros((1, 3)), np.ones(1), mass, memory, nowhere, 0.3 * 9.81 * 0.01, 0.1, 1)
+    alone = np.zeros(1, np.bool_)
+    n = reduction.wake(
+        book, np.zeros((1, 3)), np.ones(1), mass, memory, nowhere, alone, 0.3 * 9.81 * 0.01, 0.1, 0.1, 1
+    )
     assert n == wakes
+
+
+@pytest.mark.parametrize("mover", [True, False])
+def test_a_rock_that_leans_on_a_mover_wakes_sooner_and_does_not_rest(mover):
+    """Rock 0 slides at 2 cm/s or 5 mm/s, or rests; rock 1 leans on it, rock 2 on rock 1."""
+    mass, weight = np.full(3, 100.0), 100.0 * 9.81 * 0.01
+    memory = np.zeros((2, contacts.MEMORY_WIDTH), np.float32)
+    memory[:, contacts.MEMORY_FIRST], memory[:, contacts.MEMORY_SECOND] = [0, 1], [1, 2]
+    book = np.zeros((3, reduction.BOOK_WIDTH))
+    book[1:, reduction.STATUS] = RESTING
+    velocities, marks = np.zeros((3, 6)), np.zeros(3, np.bool_)
+    velocities[0, 5] = 0.02 if mover else 0.005
+    reduction.mark_by_movers(book, velocities, memory, 0.01, marks)
+    np.testing.assert_array_equal(marks, [False, mover, False])
+    # 0.1 of the weight has come upon rocks 1 and 2: a third of what wakes a rock otherwise.
+    memory[:, contacts.MEMORY_IMPULSE + 2] = [0.1 * weight, 0.2 * weight]
+    nowhere, limits = np.zeros((0, 18)), (0.3 * 9.81 * 0.01, 0.0, 0.1, 1)
+    reduction.wake(book, np.zeros((3, 3)), np.ones(3), mass, memory, nowhere, marks, *limits)
+    np.testing.assert_array_equal(book[:, reduction.STATUS], [AWAKE, AWAKE if mover else RESTING, RESTING])
+    # Long still, they may rest again, but not the one by the mover.
+    book[:, reduction.STATUS], book[:, reduction.STILL_TIME] = AWAKE, 1.0
+    far = np.full(3, 1e3)
+    reduction.rest(
+        book, np.zeros((3, 3)), velocities, np.ones(3), nowhere, marks, 0.01, 1e-3, 0.1, 0.05, -far, far, True
+    )
+    np.testing.assert_array_equal(book[:, reduction.STATUS], [RESTING, AWAKE if mover else RESTING, RESTING])
+
+
+def test_all_that_have_moved_are_woken_together_from_time_to_time():
+    """Two boxes at rest, one of which fell 5 mm: every 0.3 s it is awake, for 0.1 s; the other never."""
+    pile = make_pile([[0, 0, 0.25], [3, 0, 0.255]])
+    config = NonsmoothConfig(rest=RestConfig(recheck_period=0.3))
+    engine = make_engine(pile, [make_box(0.8, 0.6, 0.5)], config=config)
+    arrays = engine.make_arrays(pile)
+    awake = []
+    for _ in range(100):
+        awake.append(arrays.book[:, reduction.STATUS] == AWAKE)
+        arrays, _ = engine.advance(arrays)
+    assert arrays.steps == 100
+    first, second = np.transpose(awake)
+    assert not first[25:].any()
+    np.testing.assert_array_equal(np.flatnonzero(np.diff(second[25:].astype(int)) == 1) + 26, [30, 60, 90])
+    np.testing.assert_array_equal(np.flatnonzero(np.diff(second[25:].astype(int)) == -1) + 26, [40, 70])
