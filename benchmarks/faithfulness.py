@@ -79,11 +79,17 @@ VARIANTS: dict[str, tuple[dict[str, object], float]] = {
     "half-step": ({"reduction": "none"}, 0.5 * TIME_STEP),
     # Each rock for itself: what rests and wakes does not ask whether a neighbour moves, and nothing is looked at again.
     "rest-alone": (
-        {"reduction": "rest", "rest": {"mover_speed": 1e9, "wake_share": 0.1, "recheck_period": 1e9}},
+        {
+            "reduction": "rest",
+            "rest": {"mover_speed": 1e9, "wake_load": 0.3, "wake_share": 0.1, "recheck_period": 1e9},
+        },
         TIME_STEP,
     ),
     "rest-no-recheck": ({"reduction": "rest", "rest": {"recheck_period": 1e9}}, TIME_STEP),
-    "rest-movers-0.003": ({"reduction": "rest", "rest": {"mover_speed": 0.003}}, TIME_STEP),
+    "rest-movers-0.01": (
+        {"reduction": "rest", "rest": {"mover_speed": 0.01, "wake_load": 0.3, "wake_share": 0.3}},
+        TIME_STEP,
+    ),
     "plain-50": (
         {"reduction": "none", "iterations": 50, "tolerance": 1.0, "momentum": 0.0, "machine_sweeps": 3},
         TIME_STEP,

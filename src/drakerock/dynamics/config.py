@@ -22,17 +22,17 @@ class RestConfig(Config):
     speed: Annotated[float, Field(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
     mover_speed: Annotated[
         float, Field(gt=0, description="... and leans on none that is faster than this, a mover [m/s]")
-    ] = 0.01
+    ] = 0.003
     wake_load: Annotated[
         float,
         Field(
             gt=0,
             description="it wakes when the sum of its contact impulses has changed by this multiple of its weight's",
         ),
-    ] = 0.3
+    ] = 0.6
     wake_share: Annotated[
         float, Field(ge=0, description="... and of half the sum of their sizes, the pressure on it")
-    ] = 0.3
+    ] = 0.6
     wake_near_movers: Annotated[
         float, Field(ge=0, le=1, description="... both times this, if it leans on a mover")
     ] = 0.1
