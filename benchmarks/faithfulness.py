@@ -86,7 +86,6 @@ VARIANTS: dict[str, tuple[dict[str, object], float]] = {
         TIME_STEP,
     ),
     "rest-slow": ({"reduction": "rest", "rest": {"mover_speed": 0.001, "displacement": 2e-4}}, TIME_STEP),
-    "rest-no-recheck": ({"reduction": "rest", "rest": {"recheck_period": 1e9}}, TIME_STEP),
     "rest-movers-0.01": (
         {"reduction": "rest", "rest": {"mover_speed": 0.01, "wake_load": 0.3, "wake_share": 0.3}},
         TIME_STEP,

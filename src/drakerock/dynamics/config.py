@@ -36,11 +36,11 @@ class RestConfig(Config):
     wake_near_movers: Annotated[
         float, Field(ge=0, le=1, description="... both times this, if it leans on a mover")
     ] = 0.1
+    wake_steps: Annotated[int, Field(ge=1, description="... for this many steps on end")] = 1
     recheck_period: Annotated[
         float,
         Field(gt=0, description="this often all that have moved since the start are woken together [s]"),
     ] = 1.0
-    wake_steps: Annotated[int, Field(ge=1, description="... for this many steps on end")] = 1
     sensor_length: Annotated[
         float, Field(ge=0, le=10, description="rocks this far in front of the bucket are awake [m]")
     ] = 2.0

@@ -469,9 +469,9 @@ class NonsmoothEngine:
                 config.rest.wake_steps,
             )
             if new.steps % max(round(config.rest.recheck_period / dt), 1) == 0:
-                n_woken += reduction.wake_moved(book, arrays.positions)
+                n_woken += reduction.wake_all(book, arrays.positions, True)
         else:
-            reduction.wake_all(book, arrays.positions)
+            reduction.wake_all(book, arrays.positions, False)
         status = book[:, reduction.STATUS].astype(np.int64)
         awake = np.flatnonzero(status == AWAKE)
         self._velocities[:n] = arrays.velocities

@@ -159,22 +159,14 @@ def wake_rock(book: Array, positions: Array, i: int) -> None:
 
 
 @kernel
-def wake_moved(book: Array, positions: Array) -> int:
-    """Wake the resting rocks that have moved since the start; return their number."""
+def wake_all(book: Array, positions: Array, only_moved: bool) -> int:
+    """Wake all resting rocks, or those of them that have moved since the start; return their number."""
     n_woken = 0
     for i in range(len(book)):
-        if book[i, STATUS] == RESTING and book[i, MOVED] == 1.0:
+        if book[i, STATUS] == RESTING and (book[i, MOVED] == 1.0 or not only_moved):
             wake_rock(book, positions, i)
             n_woken += 1
     return n_woken
-
-
-@kernel
-def wake_all(book: Array, positions: Array) -> None:
-    """Wake all resting rocks (`reduction: none`)."""
-    for i in range(len(book)):
-        if book[i, STATUS] == RESTING:
-            wake_rock(book, positions, i)
 
 
 @kernel

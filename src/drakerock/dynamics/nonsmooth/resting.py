@@ -190,11 +190,9 @@ def solve_resting(
         iteration += 1
         if settled and iteration >= iterations:
             break
-        closing = first_plain <= iteration < iterations
-        if momentum > 0.0 and iteration % 2 == 0 and iteration < max_iterations and not closing:
-            # Just after plain sweeps what two have changed is not known.
-            goes_on = iteration < iterations or iteration >= iterations + 2
-            share = calc_share(iteration // 2 - 1, momentum) if goes_on else 0.0
+        if momentum > 0.0 and iteration % 2 == 0 and iteration < max_iterations:
+            plain = first_plain <= iteration < iterations + 2
+            share = 0.0 if plain else calc_share(iteration // 2 - 1, momentum)
             go_on_in_lanes(fields, every_batch, IMPULSE * LANES, last_impulses, share)
             go_on_in_lanes(bodies_32, awake, 0, last_velocities, share)
             go_on(rows, forwards, IMPULSE, last_machine_impulses, share)

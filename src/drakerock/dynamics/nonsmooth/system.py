@@ -96,7 +96,7 @@ class NonsmoothRocks(LeafSystem):
         n = engine.n_rocks
         arrays = engine.make_arrays(pile)
         values = _flatten(arrays)
-        # Room for more points than there are: `counts` tells how many rows of the memory count.
+        # Room for more points than there are: `counts` tells how many rows of the memory count, and the steps.
         room = engine.capacity * contacts.MEMORY_WIDTH // 2 - len(values["memory"])
         values["memory"] = np.pad(values["memory"], (0, room))
         self._groups = {name: self.DeclareDiscreteState(flat) for name, flat in values.items()}

@@ -644,7 +644,7 @@ def test_a_rock_under_pressure_wakes_by_a_share_of_it(squeeze, wakes):
 
 @pytest.mark.parametrize("mover", [True, False])
 def test_a_rock_that_leans_on_a_mover_wakes_sooner_and_does_not_rest(mover):
-    """Rock 0 slides at 2 cm/s or 5 mm/s, or rests; rock 1 leans on it, rock 2 on rock 1."""
+    """Rock 0 slides at 2 cm/s or 5 mm/s, movers from 1 cm/s; rock 1 leans on it, rock 2 on rock 1."""
     mass, weight = np.full(3, 100.0), 100.0 * 9.81 * 0.01
     memory = np.zeros((2, contacts.MEMORY_WIDTH), np.float32)
     memory[:, contacts.MEMORY_FIRST], memory[:, contacts.MEMORY_SECOND] = [0, 1], [1, 2]
@@ -654,7 +654,7 @@ def test_a_rock_that_leans_on_a_mover_wakes_sooner_and_does_not_rest(mover):
     velocities[0, 5] = 0.02 if mover else 0.005
     reduction.mark_by_movers(book, velocities, memory, 0.01, marks)
     np.testing.assert_array_equal(marks, [False, mover, False])
-    # 0.1 of the weight has come upon rocks 1 and 2: a third of what wakes a rock otherwise.
+    # The load of rock 1 has changed by 0.1 of the weight, that of rock 2 by 0.2: 0.3 wakes a rock otherwise.
     memory[:, contacts.MEMORY_IMPULSE + 2] = [0.1 * weight, 0.2 * weight]
     nowhere, limits = np.zeros((0, 18)), (0.3 * 9.81 * 0.01, 0.0, 0.1, 1)
     reduction.wake(book, np.zeros((3, 3)), np.ones(3), mass, memory, nowhere, marks, *limits)
