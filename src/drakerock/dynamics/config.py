@@ -17,22 +17,22 @@ class RestConfig(Config):
 
     displacement: Annotated[
         float, Field(gt=0, description="a rock rests when it moved less than this [m] ...")
-    ] = 0.001
+    ] = 0.0002
     time: Annotated[float, Field(gt=0, description="... within this time [s]")] = 0.1
     speed: Annotated[float, Field(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
     mover_speed: Annotated[
         float, Field(gt=0, description="... and leans on none that is faster than this, a mover [m/s]")
-    ] = 0.003
+    ] = 0.001
     wake_load: Annotated[
         float,
         Field(
             gt=0,
             description="it wakes when the sum of its contact impulses has changed by this multiple of its weight's",
         ),
-    ] = 0.6
+    ] = 0.3
     wake_share: Annotated[
         float, Field(ge=0, description="... and of half the sum of their sizes, the pressure on it")
-    ] = 0.6
+    ] = 0.3
     wake_near_movers: Annotated[
         float, Field(ge=0, le=1, description="... both times this, if it leans on a mover")
     ] = 0.1
@@ -54,7 +54,7 @@ class NonsmoothConfig(Config):
 
     iterations: Annotated[
         int, Field(ge=1, le=2000, description="least number of sweeps of the resting stage")
-    ] = 100
+    ] = 60
     tolerance: Annotated[
         float,
         Field(
@@ -107,6 +107,17 @@ class NonsmoothConfig(Config):
     contact_margin: Annotated[
         float, Field(gt=0, le=0.2, description="contacts are found this far ahead of touching [m]")
     ] = 0.005
+    search_period: Annotated[
+        int,
+        Field(
+            ge=1,
+            le=20,
+            description="contacts of slow rocks are searched every so many steps, and follow their motion between",
+        ),
+    ] = 4
+    slow_speed: Annotated[
+        float, Field(ge=0, le=0.1, description="rocks are slow below this, their turning included [m/s]")
+    ] = 0.02
     manifold_gap: Annotated[
         float, Field(ge=0, le=0.2, description="corners of faces that touch count up to this gap [m]")
     ] = 0.003

@@ -1,11 +1,12 @@
-"""Contacts in batches of eight that share no rock, and a Gauss-Seidel update of a whole batch at once.
+"""Contacts in batches of sixteen that share no rock, and a Gauss-Seidel update of a whole batch at once.
 
 The contacts of a batch have no bearing on each other, so to update them together is to update them one after the
-other. Rows are packed in single precision, field by field, so that a field of eight contacts is one vector.
+other. Rows are packed in single precision, field by field, so that a field of a batch lies in line.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,8 +32,11 @@ from drakerock.dynamics.nonsmooth.contacts import (
     TANGENT_MASS,
     TANGENT_STEP,
 )
-from drakerock.dynamics.nonsmooth.lanes import INTEGER, LANES, Lanes, transpose
+from drakerock.dynamics.nonsmooth.lanes import INTEGER, LANES, WIDTH, Lanes, gather, scatter
 from drakerock.dynamics.nonsmooth.solver import BODY_WIDTH
+
+# A vector each of the contacts of a batch: three numbers, in all lanes.
+Vectors = tuple[Lanes, ...]
 
 # Fields of a packed row: the first columns as in `contacts`, up to the impulses, then the tangential step.
 FIELD_TANGENT_STEP = IMPULSE + 3
@@ -185,6 +189,19 @@ def solve_batch(batches: BatchArrays, batch: int, bodies: Array) -> None:
     _update_batch(batches.fields, batches.bodies, batches.changes, bodies, batch)
 
 
+def _dot(a: Vectors, b: Vectors, term: Lanes) -> Lanes:
+    """Return ``a . b + term``."""
+    return a[0].times_plus(b[0], a[1].times_plus(b[1], a[2].times_plus(b[2], term)))
+
+
+def _cross(a: Vectors, b: Vectors) -> Vectors:
+    return (
+        a[1].times_plus(b[2], -(a[2] * b[1])),
+        a[2].times_plus(b[0], -(a[0] * b[2])),
+        a[0].times_plus(b[1], -(a[1] * b[0])),
+    )
+
+
 def _build_batch_update(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     def get_data(k: int) -> Any:
         return context.make_array(signature.args[k])(context, builder, arguments[k]).data
@@ -203,7 +220,7 @@ def _build_batch_update(context: Any, builder: Any, signature: Any, arguments: A
     def read(field: int) -> Lanes:
         return Lanes.load(builder, move(fields, field * LANES))
 
-    def read_vector(field: int) -> tuple[Lanes, Lanes, Lanes]:
+    def read_vector(field: int) -> Vectors:
         return read(field), read(field + 1), read(field + 2)
 
     def find_bodies(side: int) -> list[Any]:
@@ -211,77 +228,57 @@ def _build_batch_update(context: Any, builder: Any, signature: Any, arguments: A
         return [move(all_bodies, times(builder.sext(number, INTEGER), BODY_WIDTH)) for number in found]
 
     def read_bodies(pointers: list[Any]) -> list[Lanes]:
-        """Return a body's columns, eight bodies each."""
-        lower = transpose([Lanes.load(builder, pointer) for pointer in pointers])
-        return lower + transpose([Lanes.load(builder, move(pointer, LANES)) for pointer in pointers])
+        """Return a body's columns."""
+        return gather(builder, pointers) + gather(builder, [move(pointer, WIDTH) for pointer in pointers])
 
-    def write_bodies(pointers: list[Any], columns: list[Lanes]) -> None:
-        for pointer, body in zip(pointers, transpose(columns), strict=True):
-            body.store(pointer)
+    def turn(w: Vectors, inertia: Sequence[Lanes], torque: Vectors) -> Vectors:
+        """Return ``w + I^-1 torque``."""
+        xx, xy, xz, yy, yz, zz = inertia
+        rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+        return tuple(_dot(row, torque, part) for row, part in zip(rows, w, strict=True))
 
     zero, one = Lanes.fill(builder, 0.0), Lanes.fill(builder, 1.0)
     pointers_a, pointers_b = find_bodies(0), find_bodies(1)
-    columns_a, columns_b = read_bodies(pointers_a), read_bodies(pointers_b)
-    nx, ny, nz = read_vector(NORMAL)
-    tx, ty, tz = read_vector(TANGENT_1)
-    ux, uy, uz = read_vector(TANGENT_2)
-    ax, ay, az = read_vector(ARM_A)
-    bx, by, bz = read_vector(ARM_B)
     # Angular and translational velocity, inverse mass, inverse inertia xx xy xz yy yz zz.
-    wa0, wa1, wa2, va0, va1, va2, mass_a, a_xx, a_xy, a_xz, a_yy, a_yz, a_zz = columns_a[:13]
-    wb0, wb1, wb2, vb0, vb1, vb2, mass_b, b_xx, b_xy, b_xz, b_yy, b_yz, b_zz = columns_b[:13]
+    columns_a, columns_b = read_bodies(pointers_a), read_bodies(pointers_b)
+    w_a, v_a, mass_a, inertia_a = tuple(columns_a[:3]), columns_a[3:6], columns_a[6], columns_a[7:13]
+    w_b, v_b, mass_b, inertia_b = tuple(columns_b[:3]), columns_b[3:6], columns_b[6], columns_b[7:13]
+    normal, tangent_1, tangent_2 = read_vector(NORMAL), read_vector(TANGENT_1), read_vector(TANGENT_2)
+    arm_a, arm_b = read_vector(ARM_A), read_vector(ARM_B)
 
-    dx = (vb0 - va0) + (wb1 * bz - wb2 * by) + (wa2 * ay - wa1 * az)
-    dy = (vb1 - va1) + (wb2 * bx - wb0 * bz) + (wa0 * az - wa2 * ax)
-    dz = (vb2 - va2) + (wb0 * by - wb1 * bx) + (wa1 * ax - wa0 * ay)
-    old = read(IMPULSE)
-    new = old - (nx * dx + ny * dy + nz * dz + read(COMPLIANCE) * old - read(BIAS)) * read(NORMAL_MASS)
+    spins = zip(v_a, v_b, _cross(w_a, arm_a), _cross(w_b, arm_b), strict=True)
+    d = tuple((vb - va) + (sb - sa) for va, vb, sa, sb in spins)
+    old, old_1, old_2 = read_vector(IMPULSE)
+    miss = _dot(normal, d, read(COMPLIANCE).times_plus(old, -read(BIAS)))
+    new = (-miss).times_plus(read(NORMAL_MASS), old)
     new = new.where_above(zero, new, zero)
     change = new - old
 
     # Tangential: at once where it sticks, against the slip where it slides (`solver.solve_row`).
-    slip_1 = tx * dx + ty * dy + tz * dz + read(COUPLING_1) * change
-    slip_2 = ux * dx + uy * dy + uz * dz + read(COUPLING_2) * change
-    old_1, old_2 = read(IMPULSE + 1), read(IMPULSE + 2)
+    slip_1 = _dot(tangent_1, d, read(COUPLING_1) * change)
+    slip_2 = _dot(tangent_2, d, read(COUPLING_2) * change)
     mass_11, mass_12, mass_22 = read_vector(TANGENT_MASS)
-    stuck_1 = old_1 - (mass_11 * slip_1 + mass_12 * slip_2)
-    stuck_2 = old_2 - (mass_12 * slip_1 + mass_22 * slip_2)
-    step = read(FIELD_TANGENT_STEP)
-    slid_1 = old_1 - step * slip_1
-    slid_2 = old_2 - step * slip_2
+    stuck_1 = old_1 - mass_11.times_plus(slip_1, mass_12 * slip_2)
+    stuck_2 = old_2 - mass_12.times_plus(slip_1, mass_22 * slip_2)
+    step = -read(FIELD_TANGENT_STEP)
+    slid_1, slid_2 = step.times_plus(slip_1, old_1), step.times_plus(slip_2, old_2)
     limit = read(FRICTION) * new
     limit2 = limit * limit
-    size2 = slid_1 * slid_1 + slid_2 * slid_2
+    size2 = slid_1.times_plus(slid_1, slid_2 * slid_2)
     factor = size2.where_above(limit2, limit / size2.calc_root(), one)
-    stuck2 = stuck_1 * stuck_1 + stuck_2 * stuck_2
+    stuck2 = stuck_1.times_plus(stuck_1, stuck_2 * stuck_2)
     new_1 = stuck2.where_above(limit2, slid_1 * factor, stuck_1)
     new_2 = stuck2.where_above(limit2, slid_2 * factor, stuck_2)
-    for d, impulse in enumerate((new, new_1, new_2)):
-        impulse.store(move(fields, (IMPULSE + d) * LANES))
+    for k, impulse in enumerate((new, new_1, new_2)):
+        impulse.store(move(fields, (IMPULSE + k) * LANES))
     (Lanes.load(builder, changes) + change.calc_size()).store(changes)
 
     change_1, change_2 = new_1 - old_1, new_2 - old_2
-    px = nx * change + tx * change_1 + ux * change_2
-    py = ny * change + ty * change_1 + uy * change_2
-    pz = nz * change + tz * change_1 + uz * change_2
-    lx, ly, lz = ay * pz - az * py, az * px - ax * pz, ax * py - ay * px
-    velocity_a = [
-        wa0 - (a_xx * lx + a_xy * ly + a_xz * lz),
-        wa1 - (a_xy * lx + a_yy * ly + a_yz * lz),
-        wa2 - (a_xz * lx + a_yz * ly + a_zz * lz),
-        va0 - mass_a * px,
-        va1 - mass_a * py,
-        va2 - mass_a * pz,
-    ]
-    lx, ly, lz = by * pz - bz * py, bz * px - bx * pz, bx * py - by * px
-    velocity_b = [
-        wb0 + (b_xx * lx + b_xy * ly + b_xz * lz),
-        wb1 + (b_xy * lx + b_yy * ly + b_yz * lz),
-        wb2 + (b_xz * lx + b_yz * ly + b_zz * lz),
-        vb0 + mass_b * px,
-        vb1 + mass_b * py,
-        vb2 + mass_b * pz,
-    ]
-    write_bodies(pointers_a, velocity_a + columns_a[6:LANES])
-    write_bodies(pointers_b, velocity_b + columns_b[6:LANES])
+    axes = zip(normal, tangent_1, tangent_2, strict=True)
+    p = tuple(n.times_plus(change, t.times_plus(change_1, u * change_2)) for n, t, u in axes)
+    w_a, w_b = turn(w_a, inertia_a, _cross(p, arm_a)), turn(w_b, inertia_b, _cross(arm_b, p))
+    v_a = [(-mass_a).times_plus(part, v) for part, v in zip(p, v_a, strict=True)]
+    v_b = [mass_b.times_plus(part, v) for part, v in zip(p, v_b, strict=True)]
+    scatter(builder, pointers_a, [*w_a, *v_a, *columns_a[6:WIDTH]])
+    scatter(builder, pointers_b, [*w_b, *v_b, *columns_b[6:WIDTH]])
     return context.get_dummy_value()

@@ -1,8 +1,9 @@
 """Contact rows and the memory of contacts: what a contact point is, and how it is found again.
 
-Memory holds the loaded points of the last step: the pair's key, the point in the frame of the pair's first
-rock, the impulse in W, and where the search for the pair's nearest points ended. It is what makes a stored pile
-start warm and what a resting pile's force network is kept in.
+Memory holds the loaded points of the last step, and those about to touch: the pair's key, the point in the frame of
+the pair's first rock, the impulse in W, where the search for the pair's nearest points ended, the contact's normal, and its gap
+after the step. It is what makes a stored pile start warm, what a resting pile's force network is kept in, and where
+contacts come from that are not searched in every step, those of calm rocks and of rocks that move together.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ MEMORY_SECOND = 1
 MEMORY_POINT = 2  # 2..4
 MEMORY_IMPULSE = 5  # 5..7
 MEMORY_SIMPLEX = 8  # 8..9, its lower and its upper bits
-MEMORY_WIDTH = 10  # even: two numbers take the room of one of the context's
+MEMORY_NORMAL = 10  # 10..12 in the frame of the pair's first rock
+MEMORY_GAP = 13
+MEMORY_WIDTH = 14  # even: two numbers take the room of one of the context's
 
 # A pair's key is first * KEY_STEP + second; bodies are below it, so they are exact in single precision.
 KEY_STEP = 1 << 20
@@ -59,6 +62,13 @@ def read_key(memory: Array, row: int) -> int:
 def read_simplex(memory: Array, row: int) -> int:
     """Return where the search of the row's pair ended, see `gjk.encode_simplex`."""
     return int(memory[row, MEMORY_SIMPLEX]) + SIMPLEX_STEP * int(memory[row, MEMORY_SIMPLEX + 1])
+
+
+@kernel
+def is_loaded(memory: Array, row: int) -> bool:
+    """Return whether a row of the memory carried load; the others are about to touch."""
+    x, y, z = memory[row, MEMORY_IMPULSE], memory[row, MEMORY_IMPULSE + 1], memory[row, MEMORY_IMPULSE + 2]
+    return bool(x != 0.0 or y != 0.0 or z != 0.0)
 
 
 @kernel
@@ -132,9 +142,12 @@ def write_memory(
     row_key: Array,
     row_rock: Array,
     rotations: Array,
+    velocities: Array,
+    time_step: float,
+    near_gap: float,
     new: Array,
-) -> int:
-    """Write the memory of the coming step: the loaded points just solved, and all points between rocks at rest.
+) -> tuple[int, int]:
+    """Write the memory of the coming step: the points just solved, and all loaded points between rocks at rest.
 
     Args:
         n_rocks: number of rocks.
@@ -144,10 +157,14 @@ def write_memory(
         rows, n_rows: contact rows after the solve.
         row_key, row_rock: per row the pair's key and its first rock.
         rotations: (n, 3, 3) of the rocks at the poses of the solve.
+        velocities: (n, 6) of the rocks over the step [rad/s, m/s].
+        time_step: [s].
+        near_gap: points without load are kept up to this gap [m].
         new: (capacity, MEMORY_WIDTH) set, as many rows as there are points.
 
     Returns:
-        the number of points; beyond the capacity they are counted but lost.
+        the number of points; beyond the capacity they are counted but lost. And how many of them, the first, are of
+        rocks at rest.
     """
     n_new = 0
     next_active = 0
@@ -156,27 +173,34 @@ def write_memory(
             next_active += 1
             continue
         a, b = int(old[row, MEMORY_FIRST]), int(old[row, MEMORY_SECOND])
-        if status[a] == 3 or (b < n_rocks and status[b] == 3):
+        if status[a] == 3 or (b < n_rocks and status[b] == 3) or not is_loaded(old, row):
             continue
         if n_new < len(new):
             for d in range(MEMORY_WIDTH):
                 new[n_new, d] = old[row, d]
         n_new += 1
+    n_idle = n_new
     for k in range(n_rows):
         row = rows[k]
         normal, tangent_1, tangent_2 = row[IMPULSE], row[IMPULSE + 1], row[IMPULSE + 2]
-        if normal <= 0.0:
+        if normal <= 0.0 and row[GAP] >= near_gap:
             continue
         if n_new < len(new):
-            a = row_rock[k]
-            new[n_new, MEMORY_FIRST], new[n_new, MEMORY_SECOND] = (
-                row_key[k] // KEY_STEP,
-                row_key[k] % KEY_STEP,
-            )
+            a, b = row_rock[k], row_key[k] % KEY_STEP
+            new[n_new, MEMORY_FIRST], new[n_new, MEMORY_SECOND] = row_key[k] // KEY_STEP, b
+            approach = _calc_approach(velocities[a], row, ARM_A)
+            if b < n_rocks:
+                approach -= _calc_approach(velocities[b], row, ARM_B)
+            new[n_new, MEMORY_GAP] = row[GAP] - time_step * approach
             simplex = int(row[SIMPLEX])
             new[n_new, MEMORY_SIMPLEX] = simplex % SIMPLEX_STEP
             new[n_new, MEMORY_SIMPLEX + 1] = simplex // SIMPLEX_STEP
             for d in range(3):
+                new[n_new, MEMORY_NORMAL + d] = (
+                    rotations[a, 0, d] * row[NORMAL]
+                    + rotations[a, 1, d] * row[NORMAL + 1]
+                    + rotations[a, 2, d] * row[NORMAL + 2]
+                )
                 new[n_new, MEMORY_POINT + d] = (
                     rotations[a, 0, d] * row[ARM_A]
                     + rotations[a, 1, d] * row[ARM_A + 1]
@@ -186,7 +210,18 @@ def write_memory(
                     normal * row[NORMAL + d] + tangent_1 * row[TANGENT_1 + d] + tangent_2 * row[TANGENT_2 + d]
                 )
         n_new += 1
-    return n_new
+    return n_new, min(n_idle, len(new))
+
+
+@kernel
+def _calc_approach(velocity: Array, row: Array, arm: int) -> float:
+    """Return how fast the point at an arm of a row goes along its normal with a rock's velocity (6,) [m/s]."""
+    x, y, z = row[arm], row[arm + 1], row[arm + 2]
+    return float(
+        row[NORMAL] * (velocity[3] + velocity[1] * z - velocity[2] * y)
+        + row[NORMAL + 1] * (velocity[4] + velocity[2] * x - velocity[0] * z)
+        + row[NORMAL + 2] * (velocity[5] + velocity[0] * y - velocity[1] * x)
+    )
 
 
 @kernel

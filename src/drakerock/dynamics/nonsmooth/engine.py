@@ -88,6 +88,7 @@ class RockArrays:
         velocities: (n, 6) angular, translational in W.
         book: (n, reduction.BOOK_WIDTH) status and bookkeeping of the reduction.
         memory: (m, contacts.MEMORY_WIDTH) float32, loaded contact points; m changes from step to step.
+        n_idle: so many of them, the first, are of rocks that were at rest in the last step.
         steps: how many have been taken.
     """
 
@@ -96,6 +97,7 @@ class RockArrays:
     velocities: Array
     book: Array
     memory: NDArray[np.float32]
+    n_idle: int = 0
     steps: int = 0
 
 
@@ -261,8 +263,9 @@ class NonsmoothEngine:
         self._axes = np.zeros((places, 3), np.float32)
         self._statistics = np.zeros(4, np.int64)
         self._narrow_workspace = narrow_phase.make_workspace()
-        self._sums = np.zeros((n, 3))
         self._by_movers = np.zeros(n, np.bool_)
+        self._calm = np.full(n_bodies, broad_phase.SEARCHED, np.int8)
+        self._seeks = np.zeros(n, np.bool_)
         self._cell_start = np.zeros(2, np.int64)
         self._allocate_pairs(20 * n + 256)
         self._allocate_rows(6 * n + 256)
@@ -332,7 +335,9 @@ class NonsmoothEngine:
         """Return the pile of state arrays, contact memory included."""
         rows = arrays.memory
         pairs = rows[:, [contacts.MEMORY_FIRST, contacts.MEMORY_SECOND]].astype(np.int64)
-        kept = pairs[:, 1] < self.first_piece  # the machine's are not the pile's
+        # The machine's are not the pile's, and what carries no load is found again.
+        loaded = rows[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3].any(axis=1)
+        kept = loaded & (pairs[:, 1] < self.first_piece)
         pairs, rows = pairs[kept], rows[kept]
         # Surfaces of the site are -1, -2, ...: independent of the number of rocks.
         surface = pairs[:, 1] >= self.n_rocks
@@ -369,12 +374,16 @@ class NonsmoothEngine:
         return np.asarray(outside.any(axis=1))
 
     def place(self, arrays: RockArrays, rocks: IntArray, p_WRs: Array, V_WRs: Array) -> RockArrays:
-        """Return the state with rocks put at positions (m, 3) with velocities (m, 6), awake."""
+        """Return the state with rocks put at positions (m, 3) with velocities (m, 6), awake, their contacts forgotten."""
+        pairs = arrays.memory[:, [contacts.MEMORY_FIRST, contacts.MEMORY_SECOND]]
+        kept = ~np.isin(pairs, rocks).any(axis=1)
         new = replace(
             arrays,
             positions=arrays.positions.copy(),
             velocities=arrays.velocities.copy(),
             book=arrays.book.copy(),
+            memory=arrays.memory[kept],
+            n_idle=int(kept[: arrays.n_idle].sum()),
         )
         new.positions[rocks] = p_WRs
         new.velocities[rocks] = V_WRs
@@ -422,11 +431,11 @@ class NonsmoothEngine:
                 raise SimulationFailure(f"rocks: {name} that are not finite")
         iterations, momentum = self.config.iterations, self.config.momentum
         room = room or self.make_room()
-        new, report = self._try_step(arrays, machine, room, iterations, momentum, warm=True)
+        new, report = self._try_step(arrays, machine, room, iterations, momentum, warm=True, search_all=False)
         if new is not None and report is not None and report.residual <= self.config.max_residual:
             return new, report
         again, better = self._try_step(
-            arrays, machine, room, RETRY_FACTOR * iterations, 0.0, warm=new is not None
+            arrays, machine, room, RETRY_FACTOR * iterations, 0.0, warm=new is not None, search_all=True
         )
         if again is None or better is None:
             raise SimulationFailure("rocks: the contact solve gave values that are not finite")
@@ -445,6 +454,7 @@ class NonsmoothEngine:
         iterations: int,
         momentum: float,
         warm: bool,
+        search_all: bool,
     ) -> tuple[RockArrays, StepReport] | tuple[None, None]:
         config, n, dt = self.config, self.n_rocks, self.time_step
         new = replace(room, steps=arrays.steps + 1)
@@ -453,7 +463,7 @@ class NonsmoothEngine:
         n_woken = 0
         if config.reduction == "rest":
             reduction.mark_by_movers(
-                book, arrays.velocities, memory, config.rest.mover_speed, self._by_movers
+                book, arrays.velocities, memory, arrays.n_idle, config.rest.mover_speed, self._by_movers
             )
             n_woken = reduction.wake(
                 book,
@@ -474,14 +484,21 @@ class NonsmoothEngine:
             reduction.wake_all(book, arrays.positions, False)
         status = book[:, reduction.STATUS].astype(np.int64)
         awake = np.flatnonzero(status == AWAKE)
+        follow = not search_all and arrays.steps % config.search_period != 0
+        self._calm[: self.first_piece] = broad_phase.CALM if follow else broad_phase.SEARCHED
+        if follow:
+            reduction.mark_calm(
+                arrays.book, status, arrays.positions, arrays.velocities, self.radius, machine.sensors,
+                config.slow_speed, self._calm,
+            )  # fmt: skip
         self._velocities[:n] = arrays.velocities
         self._velocities[n + 1 :] = machine.arrays.jacobian @ machine.velocity
         self._pose(arrays, machine, status)
         motion.set_bodies(awake, arrays.velocities, self.inverse_mass, self._inverse_inertia, self._bodies)
 
-        n_pairs = self._find_pairs(status, awake)
+        n_pairs = self._find_pairs(status)
         places, n_active = contacts.index_memory(memory, n, status, self._active, self._table)
-        n_rows = self._find_contacts(n_pairs, memory, self._table[:places])
+        n_rows = self._find_contacts(n_pairs, memory, self._table[:places], n_active)
         rows, body_a, body_b = self._rows, self._body_a, self._body_b
         if -rows[:n_rows, contacts.GAP].min(initial=0.0) > DEEP_SHARE * config.max_penetration:
             iterations *= RETRY_FACTOR
@@ -528,23 +545,21 @@ class NonsmoothEngine:
             self._bodies[:] = 0.0
             self._bodies_32[:] = 0.0
             return None, None
-        n_memory = contacts.write_memory(
+        n_memory, n_idle = contacts.write_memory(
             n, status, memory, self._active, n_active, rows, n_rows, self._row_key,
-            self._row_rock, self._rotations, new.memory,
+            self._row_rock, self._rotations, new.velocities, dt,
+            2.0 * config.slow_speed * dt * (config.search_period - 1), new.memory,
         )  # fmt: skip
-        new.memory = new.memory[:n_memory]
+        new.memory, new.n_idle = new.memory[:n_memory], n_idle
         if config.reduction == "rest":
             reduction.mark_by_movers(
-                book, new.velocities, new.memory, config.rest.mover_speed, self._by_movers
+                book, new.velocities, new.memory, n_idle, config.rest.mover_speed, self._by_movers
             )
         n_rested, n_lost = reduction.rest(
             book, new.positions, new.velocities, self.radius, machine.sensors, self._by_movers, dt,
             config.rest.displacement, config.rest.time, config.rest.speed, self._lower_site, self._upper_site,
             config.reduction == "rest",
         )  # fmt: skip
-        if n_rested > 0:
-            contacts.sum_impulses(new.memory, n, self._sums)
-            reduction.set_references(book, self._sums)
         loaded = rows[:n_rows, contacts.IMPULSE] > 0.0
         depths = -rows[:n_rows, contacts.GAP][loaded]
         max_penetration = float(depths.max(initial=0.0))
@@ -587,19 +602,21 @@ class NonsmoothEngine:
             self._velocities[n + 1 :], dt, margin, self._positions, self._rotations, self._lower, self._upper,
         )  # fmt: skip
 
-    def _find_pairs(self, status: IntArray, awake: IntArray) -> int:
+    def _find_pairs(self, status: IntArray) -> int:
         n = self.n_rocks
         pieces = np.arange(self.first_piece, self.first_piece + len(self.piece_body))
-        low, high = broad_phase.find_region(awake, pieces, self._lower, self._upper)
+        self._seeks[:] = (status == AWAKE) & (self._calm[:n] != broad_phase.CALM)
+        all_seekers = np.flatnonzero(self._seeks)
+        low, high = broad_phase.find_region(all_seekers, pieces, self._lower, self._upper)
         grids = [self._sort_grid(rocks, reach, low, high) for rocks, reach in self._grids]
         while True:
             n_pairs = 0
             for items, *_ in grids:
-                seekers = items[status[items] == AWAKE]
+                seekers = items[self._seeks[items]]
                 for grid in grids:
                     n_pairs = self._search(seekers, status, grid, n_pairs)
             n_pairs = broad_phase.find_static_pairs(
-                awake, n, self.first_plane, self.planes, self._lower, self._upper,
+                all_seekers, n, self.first_plane, self.planes, self._lower, self._upper,
                 self._pair_a, self._pair_b, n_pairs,
             )  # fmt: skip
             # The machine's pairs come last.
@@ -636,21 +653,29 @@ class NonsmoothEngine:
         items, boxes, origin, inverse_width, n_cells, cell_start, reach = grid
         return int(
             broad_phase.find_rock_pairs(
-                seekers, self.n_rocks, status, self._lower, self._upper, origin, inverse_width, n_cells,
+                seekers, self.n_rocks, status, self._seeks, self._lower, self._upper, origin, inverse_width, n_cells,
                 cell_start, items, boxes, reach, self._pair_a, self._pair_b, n_pairs,
             )
         )  # fmt: skip
 
-    def _find_contacts(self, n_pairs: int, memory: NDArray[np.float32], table: IntArray) -> int:
+    def _find_contacts(
+        self, n_pairs: int, memory: NDArray[np.float32], table: IntArray, n_active: int
+    ) -> int:
         config = self.config
         while True:
+            n_rows = narrow_phase.follow_contacts(
+                memory, self._active, n_active, self._calm, self._positions, self._rotations,
+                self.solver_body, self.friction, self.restitution, self._rows, self._body_a, self._body_b,
+                self._row_key, self._row_rock,
+            )  # fmt: skip
             n_rows = narrow_phase.find_contacts(
                 self._pair_a, self._pair_b, n_pairs, self.n_rocks, self.first_plane, self.first_piece,
                 self.planes, self.convex, self.shape, self.scale, self._positions, self._rotations,
                 self._velocities, self.solver_body, self.friction, self.restitution, self.time_step,
-                config.contact_margin, config.manifold_gap, config.face_cosine, config.manifold_points, memory, table,
+                config.contact_margin, config.manifold_gap, config.face_cosine, config.manifold_points, self._calm,
+                config.slow_speed, memory, table,
                 self._axis_keys, self._axes, self._rows, self._body_a, self._body_b, self._row_key,
-                self._row_rock, self._statistics, self._narrow_workspace,
+                self._row_rock, n_rows, self._statistics, self._narrow_workspace,
             )  # fmt: skip
             if n_rows <= len(self._rows):
                 return int(n_rows)

@@ -12,7 +12,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from drakerock.dynamics.nonsmooth.compiling import Array, kernel
-from drakerock.dynamics.nonsmooth.lanes import LANES, Lanes
+from drakerock.dynamics.nonsmooth.lanes import WIDTH, Lanes
 
 # Nesterov's share n / (n + OFFSET) of the n-th time.
 OFFSET = 3.0
@@ -54,8 +54,8 @@ def go_on_in_lanes(values: Array, rows: Array, first: int, last: Array, share: f
     """
     width = values.shape[1]
     for k in range(len(rows)):
-        for v in range(last.shape[1] // LANES):
-            place = LANES * v
+        for v in range(last.shape[1] // WIDTH):
+            place = WIDTH * v
             _go_on(values, rows[k] * width + first + place, last, k * last.shape[1] + place, share)
 
 
@@ -71,7 +71,7 @@ def _build_go_on(context: Any, builder: Any, signature: Any, arguments: Any) -> 
         return builder.gep(context.make_array(signature.args[k])(context, builder, array).data, [number])
 
     pointer, last_pointer = find(0, values, place), find(2, last, last_place)
-    now, before = Lanes.load(builder, pointer), Lanes.load(builder, last_pointer)
-    (now + Lanes.spread(builder, share) * (now - before)).store(pointer)
+    now, before = Lanes.load(builder, pointer, WIDTH), Lanes.load(builder, last_pointer, WIDTH)
+    (now + Lanes.spread(builder, share, WIDTH) * (now - before)).store(pointer)
     now.store(last_pointer)
     return context.get_dummy_value()

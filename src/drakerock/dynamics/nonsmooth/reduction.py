@@ -16,9 +16,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, LOST, RESTING
+from drakerock.dynamics.nonsmooth.collision.broad_phase import (
+    AWAKE,
+    CALM,
+    COMOVING,
+    FIXED,
+    LOST,
+    RESTING,
+    SEARCHED,
+)
 from drakerock.dynamics.nonsmooth.compiling import Array, allocating_kernel, kernel
-from drakerock.dynamics.nonsmooth.contacts import MEMORY_FIRST, MEMORY_SECOND, sum_impulses, sum_pressures
+from drakerock.dynamics.nonsmooth.contacts import (
+    MEMORY_FIRST,
+    MEMORY_SECOND,
+    is_loaded,
+    sum_impulses,
+    sum_pressures,
+)
 
 # Columns of a rock's bookkeeping (all stored in the context).
 STATUS = 0
@@ -54,21 +68,23 @@ def is_sensed(x: float, y: float, z: float, radius: float, sensors: Array) -> bo
 
 
 @kernel
-def mark_by_movers(book: Array, velocities: Array, memory: Array, mover_speed: float, marks: Array) -> None:
+def mark_by_movers(
+    book: Array, velocities: Array, memory: Array, n_idle: int, mover_speed: float, marks: Array
+) -> None:
     """Mark the rocks that share a loaded contact with a mover.
 
     Args:
         book: (n, BOOK_WIDTH).
         velocities: (n, 6).
-        memory: loaded contact points, see `contacts`.
+        memory, n_idle: loaded contact points, see `contacts`; the first so many are of rocks at rest.
         mover_speed: awake rocks that are faster are movers [m/s].
         marks: (n,) bool, set.
     """
     n = len(book)
     marks[:] = False
-    for row in range(len(memory)):
+    for row in range(n_idle, len(memory)):
         a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
-        if b < n:
+        if b < n and is_loaded(memory, row):
             if _moves(book, velocities, a, mover_speed):
                 marks[b] = True
             if _moves(book, velocities, b, mover_speed):
@@ -81,6 +97,42 @@ def _moves(book: Array, velocities: Array, i: int, speed: float) -> bool:
         return False
     x, y, z = velocities[i, 3], velocities[i, 4], velocities[i, 5]
     return bool(x * x + y * y + z * z > speed * speed)
+
+
+@kernel
+def mark_calm(
+    book: Array,
+    status: Array,
+    positions: Array,
+    velocities: Array,
+    radius: Array,
+    sensors: Array,
+    slow_speed: float,
+    calm: Array,
+) -> None:
+    """Mark the rocks whose contacts need no search in this step: slow ones, and those that do not move at all.
+
+    Fast ones are COMOVING. All contacts are searched of rocks that are just woken, as what they touch may have moved
+    meanwhile, and of those in the sensor, which the bucket may strike in the next step.
+
+    Args:
+        book: (n, BOOK_WIDTH) before the step.
+        status: (n,) in the step.
+        positions, velocities, radius, sensors: see `wake` and `is_sensed`.
+        slow_speed: below it rocks are slow, their turning at their bounding spheres included [m/s].
+        calm: (n,) at least, set: CALM, COMOVING or SEARCHED.
+    """
+    for i in range(len(book)):
+        calm[i] = CALM if status[i] == RESTING or status[i] == FIXED else SEARCHED
+        if (
+            status[i] == AWAKE
+            and book[i, STATUS] == AWAKE
+            and not is_sensed(positions[i, 0], positions[i, 1], positions[i, 2], radius[i], sensors)
+        ):
+            v = velocities[i]
+            spin = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+            speed = np.sqrt(v[3] * v[3] + v[4] * v[4] + v[5] * v[5])
+            calm[i] = CALM if speed + radius[i] * spin < slow_speed else COMOVING
 
 
 @allocating_kernel
@@ -125,6 +177,10 @@ def wake(
     change2 = np.empty(n)
     for i in range(n):
         if book[i, STATUS] == RESTING:
+            if book[i, CHANGED_STEPS] == NEW:
+                book[i, CHANGED_STEPS] = 0.0
+                for d in range(3):
+                    book[i, REFERENCE + d] = sums[i, d]
             change2[i] = 0.0
             for d in range(3):
                 change2[i] += (sums[i, d] - book[i, REFERENCE + d]) ** 2
@@ -196,7 +252,7 @@ def rest(
         may_rest: False: only lost rocks are looked for.
 
     Returns:
-        number of rocks that came to rest (their reference is left to `set_references`), number lost.
+        number of rocks that came to rest (their reference is set by the next `wake`), number lost.
     """
     n_rested, n_lost = 0, 0
     for i in range(len(book)):
@@ -237,13 +293,3 @@ def rest(
                 velocities[i, d] = 0.0
             n_rested += 1
     return n_rested, n_lost
-
-
-@kernel
-def set_references(book: Array, sums: Array) -> None:
-    """Keep the sum of the contact impulses (n, 3) of the rocks that have just come to rest."""
-    for i in range(len(book)):
-        if book[i, STATUS] == RESTING and book[i, CHANGED_STEPS] == NEW:
-            book[i, CHANGED_STEPS] = 0.0
-            for d in range(3):
-                book[i, REFERENCE + d] = sums[i, d]

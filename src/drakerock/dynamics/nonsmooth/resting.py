@@ -13,14 +13,15 @@ from drakerock.dynamics.nonsmooth.batches import (
     unpack_impulses,
 )
 from drakerock.dynamics.nonsmooth.compiling import Array, allocating_kernel, kernel
-from drakerock.dynamics.nonsmooth.contacts import IMPULSE
-from drakerock.dynamics.nonsmooth.lanes import LANES
+from drakerock.dynamics.nonsmooth.contacts import BIAS, IMPULSE
+from drakerock.dynamics.nonsmooth.lanes import LANES, WIDTH
 from drakerock.dynamics.nonsmooth.momentum import calc_share, go_on, go_on_in_lanes
 from drakerock.dynamics.nonsmooth.solver import (
     INVERSE_INERTIA,
     ROW_IMPULSE,
     MachineArrays,
     apply_impulses,
+    calc_normal_velocity,
     solve_machine_contacts,
     solve_machine_rows,
 )
@@ -29,6 +30,10 @@ from drakerock.dynamics.nonsmooth.solver import (
 NEIGHBOURHOOD = 2
 # One in so many of the iterations is without momentum, the last ones.
 PLAIN = 10
+# Points that carry no load and, as bodies move now, will not touch within so many steps are idle: they are looked at in
+# one pair of sweeps of so many, and swept with the others from the first impulse on.
+IDLE_STEPS = 4.0
+IDLE_PERIOD = 5
 
 
 @kernel
@@ -67,21 +72,65 @@ def _mark_neighbourhood(
 
 @allocating_kernel
 def _make_all_batches(
-    n_free: int, n_rows: int, body_a: Array, body_b: Array, n_rocks: int, marks: Array, members: Array
-) -> tuple[int, int]:
-    """Put the rocks' rows into batches, the machine's neighbourhood first; return how many it has, and all."""
+    rows: Array,
+    n_free: int,
+    n_rows: int,
+    body_a: Array,
+    body_b: Array,
+    bodies: Array,
+    n_rocks: int,
+    marks: Array,
+    members: Array,
+) -> tuple[int, int, int]:
+    """Put the rocks' rows into batches: the machine's neighbourhood, others under load, those without.
+
+    Returns:
+        how many the neighbourhood has, how many these two have, how many there are.
+    """
     _mark_neighbourhood(n_free, n_rows, body_a, body_b, n_rocks, marks)
-    near, far = np.empty(n_free, np.int64), np.empty(n_free, np.int64)
-    n_near = 0
+    chosen, group = np.empty(n_free, np.int64), np.empty(n_free, np.int64)
     for k in range(n_free):
-        if marks[body_a[k]] > 0 or marks[body_b[k]] > 0:
-            near[n_near] = k
-            n_near += 1
+        if _is_idle(rows[k], bodies[body_a[k]], bodies[body_b[k]]):
+            group[k] = 2
+        elif marks[body_a[k]] > 0 or marks[body_b[k]] > 0:
+            group[k] = 0
         else:
-            far[k - n_near] = k
+            group[k] = 1
     marks[:] = 0
-    n_batches = make_batches(near[:n_near], body_a, body_b, n_rocks, marks, members, 0)
-    return n_batches, make_batches(far[: n_free - n_near], body_a, body_b, n_rocks, marks, members, n_batches)
+    n_batches, ends = 0, np.empty(3, np.int64)
+    for number in range(3):
+        n_chosen = 0
+        for k in range(n_free):
+            if group[k] == number:
+                chosen[n_chosen] = k
+                n_chosen += 1
+        n_batches = make_batches(chosen[:n_chosen], body_a, body_b, n_rocks, marks, members, n_batches)
+        ends[number] = n_batches
+    return ends[0], ends[1], ends[2]
+
+
+@kernel
+def _choose_idle(batches: BatchArrays, first: int, last: int, every: bool, swept: Array) -> int:
+    """Choose the batches of idle points to be swept: every one, or those that carry load by now; return how many."""
+    n_swept = 0
+    for k in range(first, last):
+        loaded = every
+        for lane in range(LANES):
+            # Momentum may have gone on below zero, which the next sweep mends.
+            loaded |= batches.fields[k, IMPULSE, lane] != 0.0
+        if loaded:
+            swept[n_swept] = k
+            n_swept += 1
+    return n_swept
+
+
+@kernel
+def _is_idle(row: Array, body_a: Array, body_b: Array) -> bool:
+    """Return whether a point carries no load and will not touch within `IDLE_STEPS`."""
+    if row[IMPULSE] > 0.0 or row[BIAS] >= 0.0:
+        return False
+    # Apart, the bias is the speed at which they meet within the step.
+    return calc_normal_velocity(row, body_a, body_b) * IDLE_STEPS > row[BIAS]
 
 
 @kernel
@@ -119,7 +168,7 @@ def solve_resting(
     followed by `machine_sweeps` over the machine's own rows, its contacts and their neighbourhood. A light rock that
     the machine presses on others passes on little of the machine's momentum per sweep. After every second one all are
     continued on their way, see `momentum`; but for the last tenth of `iterations`, in which what goes to and fro with
-    momentum comes to an end.
+    momentum comes to an end. Points that carry no load, and are not about to, are left out of most sweeps.
 
     The sweeps over the rocks run in single precision; the velocities are then made anew from the impulses in
     double precision, so that momentum is kept to rounding.
@@ -153,28 +202,37 @@ def solve_resting(
     forwards = np.arange(n_free, n_rows)
     backwards = forwards[::-1].copy()
     scratch = np.empty((3, 6))
-    n_near, n_batches = _make_all_batches(n_free, n_rows, body_a, body_b, n_rocks, marks, batches.members)
+    n_near, n_loaded, n_batches = _make_all_batches(
+        rows, n_free, n_rows, body_a, body_b, bodies, n_rocks, marks, batches.members
+    )
     pack(rows, body_a, body_b, n_rocks, batches, n_batches)
     every_batch, every_motor = np.arange(n_batches), np.arange(len(machine.row_values))
     one_body, fields = np.zeros(1, np.int64), batches.fields.reshape(len(batches.fields), FIELDS * LANES)
     last_impulses = np.zeros((n_batches, 3 * LANES), np.float32)
     # With two columns that do not change, so that a rock is one vector.
-    last_velocities = np.zeros((len(awake), LANES), np.float32)
+    last_velocities = np.zeros((len(awake), WIDTH), np.float32)
     last_machine_impulses = np.zeros((n_rows - n_free, 3))
     last_motors, last_velocity = np.zeros((len(every_motor), 1)), np.zeros((1, len(velocity)))
     first_plain = iterations - iterations // PLAIN
     changed = 0.0
     iteration = 0
+    swept = np.empty(n_batches - n_loaded, np.int64)
+    n_swept = 0
     while iteration < max_iterations:
         settled = False
+        if iteration % 2 == 0:
+            n_swept = _choose_idle(batches, n_loaded, n_batches, (iteration // 2) % IDLE_PERIOD == 0, swept)
         for sweep in range(1 + machine_sweeps):
-            n = n_batches if sweep == 0 else n_near
+            n = n_near if sweep > 0 else n_loaded
             if len(machine.row_values) > 0:
                 solve_machine_rows(machine, velocity)
             batches.changes[:] = 0.0
             if (iteration + sweep) % 2 == 0:
                 for k in range(n):
                     solve_batch(batches, k, bodies_32)
+                if sweep == 0:
+                    for k in range(n_swept):
+                        solve_batch(batches, swept[k], bodies_32)
                 change = solve_machine_contacts(
                     rows, forwards, body_a, body_b, bodies_32, n_rocks, machine, velocity, scratch
                 )
@@ -182,6 +240,9 @@ def solve_resting(
                 change = solve_machine_contacts(
                     rows, backwards, body_a, body_b, bodies_32, n_rocks, machine, velocity, scratch
                 )
+                if sweep == 0:
+                    for k in range(n_swept - 1, -1, -1):
+                        solve_batch(batches, swept[k], bodies_32)
                 for k in range(n - 1, -1, -1):
                     solve_batch(batches, k, bodies_32)
             if sweep == 0:

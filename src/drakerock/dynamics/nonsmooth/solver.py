@@ -175,6 +175,13 @@ def _relative_velocity(row: Array, body_a: Array, body_b: Array) -> Vector:
 
 
 @kernel
+def calc_normal_velocity(row: Array, body_a: Array, body_b: Array) -> float:
+    """Return how fast a row's points part along its normal [m/s]."""
+    dx, dy, dz = _relative_velocity(row, body_a, body_b)
+    return float(row[NORMAL] * dx + row[NORMAL + 1] * dy + row[NORMAL + 2] * dz)
+
+
+@kernel
 def _relative_velocity_machine(row: Array, body_a: Array, spatial: Array) -> Vector:
     """Return the velocity of a point of a machine body, of spatial velocity (6,), against A's."""
     bx, by, bz = row[ARM_B], row[ARM_B + 1], row[ARM_B + 2]

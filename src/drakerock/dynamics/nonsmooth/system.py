@@ -96,7 +96,7 @@ class NonsmoothRocks(LeafSystem):
         n = engine.n_rocks
         arrays = engine.make_arrays(pile)
         values = _flatten(arrays)
-        # Room for more points than there are: `counts` tells how many rows of the memory count, and the steps.
+        # Room for more points than there are: `counts` tells how many rows of the memory count, and the like.
         room = engine.capacity * contacts.MEMORY_WIDTH // 2 - len(values["memory"])
         values["memory"] = np.pad(values["memory"], (0, room))
         self._groups = {name: self.DeclareDiscreteState(flat) for name, flat in values.items()}
@@ -157,6 +157,7 @@ class NonsmoothRocks(LeafSystem):
             state["book"].reshape(n, reduction.BOOK_WIDTH),
             state["memory"].view(np.float32).reshape(-1, contacts.MEMORY_WIDTH)[: int(state["counts"][0])],
             int(state["counts"][1]),
+            int(state["counts"][2]),
         )
 
     def _write(self, discrete: DiscreteValues, values: dict[str, Array]) -> None:
@@ -233,7 +234,7 @@ def _flatten(arrays: RockArrays, report: Array | None = None) -> dict[str, Array
         "velocities": arrays.velocities.reshape(-1),
         "book": arrays.book.reshape(-1),
         "memory": arrays.memory.reshape(-1).view(np.float64),  # bits, two numbers in one
-        "counts": np.array([float(len(arrays.memory)), float(arrays.steps)]),
+        "counts": np.array([len(arrays.memory), arrays.n_idle, arrays.steps], float),
         "report": np.zeros(len(ROCK_SUMMARY) + 6) if report is None else report,
     }
 

@@ -56,7 +56,7 @@ def test_batches_hold_every_row_once_and_no_rock_twice(seed, n_rows, n_rocks):
 
 
 def test_a_batch_is_updated_like_its_rows_one_by_one():
-    """Sticking, sliding and parting contacts: eight at once in single precision, against the scalar update."""
+    """Sticking, sliding and parting contacts: sixteen at once in single precision, against the scalar update."""
     rng = np.random.default_rng(3)
     rows, body_a, body_b, bodies = draw_rows(rng, 400, 60)
     arrays = batches.make_batch_arrays(len(rows))

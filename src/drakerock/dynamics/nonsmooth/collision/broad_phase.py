@@ -15,6 +15,8 @@ from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, allocating_k
 
 # How a rock is treated.
 AWAKE, RESTING, FIXED, LOST = 0, 1, 2, 3
+# How its contacts are found in a step: all searched; from memory with those that move like it; with all that are calm.
+SEARCHED, COMOVING, CALM = 0, 1, 2
 
 
 @kernel
@@ -25,10 +27,10 @@ def _find_cell(value: float, origin: float, inverse_width: float, n_cells: int) 
 
 
 @allocating_kernel
-def find_region(awake: Array, others: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return the corners (3,) of the box around the boxes of awake rocks and of other bodies [m]."""
+def find_region(seekers: Array, others: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return the corners (3,) of the box around the boxes of rocks and of other bodies [m]."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for bodies in (awake, others):
+    for bodies in (seekers, others):
         for s in range(len(bodies)):
             for d in range(3):
                 low[d] = min(low[d], lower[bodies[s], d])
@@ -139,6 +141,7 @@ def find_rock_pairs(
     seekers: Array,
     n_rocks: int,
     status: Array,
+    seeks: Array,
     lower: Array,
     upper: Array,
     origin: Array,
@@ -155,9 +158,10 @@ def find_rock_pairs(
     """Add the pairs of seekers with the rocks of one grid.
 
     Args:
-        seekers: awake rocks, and bodies of the machine (index >= n_rocks), whose neighbours are wanted.
+        seekers: rocks, and bodies of the machine (index >= n_rocks), whose neighbours are wanted.
         n_rocks: number of rocks.
         status: (n,) AWAKE, RESTING, FIXED or LOST.
+        seeks: (n,) bool, the rocks that are among the seekers of some call.
         lower, upper: (bodies, 3) bounding boxes, margins included [m].
         origin, inverse_width, n_cells, cell_start, items, boxes: of the grid, see `sort_into_grid`.
         reach: how far a rock of this grid reaches from its centre at most [m].
@@ -194,8 +198,8 @@ def find_rock_pairs(
                     j = items[k]
                     if j == i or status[j] == LOST:
                         continue
-                    # Two awake rocks find each other twice.
-                    if i < n_rocks and status[j] == AWAKE and i > j:
+                    # Two seekers find each other twice.
+                    if i < n_rocks and seeks[j] and i > j:
                         continue
                     if n_pairs < len(pair_a):
                         pair_a[n_pairs] = min(i, j)
@@ -206,7 +210,7 @@ def find_rock_pairs(
 
 @kernel
 def find_static_pairs(
-    awake: Array,
+    seekers: Array,
     first_static: int,
     last_static: int,
     planes: Array,
@@ -216,10 +220,10 @@ def find_static_pairs(
     pair_b: Array,
     n_pairs: int,
 ) -> int:
-    """Add the pairs of awake rocks with static pieces and planes.
+    """Add the pairs of rocks with static pieces and planes.
 
     Args:
-        awake: rocks.
+        seekers: rocks.
         first_static, last_static: range of the static pieces among the bodies; planes follow in the index.
         planes: (p, 4) unit normal out of the solid and offset.
         lower, upper, pair_a, pair_b, n_pairs: as for `find_rock_pairs`.
@@ -227,8 +231,8 @@ def find_static_pairs(
     Returns:
         as `find_rock_pairs`.
     """
-    for s in range(len(awake)):
-        i = awake[s]
+    for s in range(len(seekers)):
+        i = seekers[s]
         for j in range(first_static, last_static):
             if _boxes_meet(lower, upper, i, j):
                 if n_pairs < len(pair_a):

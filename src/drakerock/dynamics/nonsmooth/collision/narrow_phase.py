@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from drakerock.dynamics.nonsmooth.collision.broad_phase import CALM, SEARCHED
 from drakerock.dynamics.nonsmooth.collision.geometry import (
     calc_support_distance,
     get_corner,
@@ -39,8 +40,12 @@ from drakerock.dynamics.nonsmooth.contacts import (
     GAP,
     IMPULSE,
     KEY_STEP,
+    MEMORY_FIRST,
+    MEMORY_GAP,
     MEMORY_IMPULSE,
+    MEMORY_NORMAL,
     MEMORY_POINT,
+    MEMORY_SECOND,
     NORMAL,
     RESTITUTION,
     SIMPLEX,
@@ -48,6 +53,7 @@ from drakerock.dynamics.nonsmooth.contacts import (
     TANGENT_2,
     find_axis,
     find_in_memory,
+    is_loaded,
     read_key,
     read_simplex,
 )
@@ -150,6 +156,138 @@ def _add_fast_points(
 
 
 @kernel
+def _write_row(
+    rows: Array,
+    n_rows: int,
+    n: tuple[float, float, float],
+    point: tuple[float, float, float],
+    positions: Array,
+    a: int,
+    b: int,
+    gap: float,
+    impulse: tuple[float, float, float],
+    mu: float,
+    restitution: float,
+    simplex: int,
+) -> None:
+    """Set a contact row: normal, point from A's origin, gap, impulse in W, friction, restitution, simplex."""
+    nx, ny, nz = n
+    x, y, z = point
+    ix, iy, iz = impulse
+    tx, ty, tz, ux, uy, uz = make_tangents(nx, ny, nz)
+    out = rows[n_rows]
+    out[NORMAL], out[NORMAL + 1], out[NORMAL + 2] = nx, ny, nz
+    out[TANGENT_1], out[TANGENT_1 + 1], out[TANGENT_1 + 2] = tx, ty, tz
+    out[TANGENT_2], out[TANGENT_2 + 1], out[TANGENT_2 + 2] = ux, uy, uz
+    out[ARM_A], out[ARM_A + 1], out[ARM_A + 2] = x, y, z
+    out[ARM_B] = x + positions[a, 0] - positions[b, 0]
+    out[ARM_B + 1] = y + positions[a, 1] - positions[b, 1]
+    out[ARM_B + 2] = z + positions[a, 2] - positions[b, 2]
+    out[FRICTION] = mu
+    out[GAP] = gap
+    out[SIMPLEX] = simplex
+    out[RESTITUTION] = restitution
+    out[IMPULSE] = max(ix * nx + iy * ny + iz * nz, 0.0)
+    out[IMPULSE + 1] = ix * tx + iy * ty + iz * tz
+    out[IMPULSE + 2] = ix * ux + iy * uy + iz * uz
+
+
+@kernel
+def _follow_row(
+    memory: Array,
+    row: int,
+    positions: Array,
+    rotations: Array,
+    solver_body: Array,
+    friction: Array,
+    restitution: Array,
+    rows: Array,
+    body_a: Array,
+    body_b: Array,
+    row_key: Array,
+    row_rock: Array,
+    n_rows: int,
+) -> int:
+    """Set a contact row from the memory; return the number of rows.
+
+    Point and normal are carried by the pair's first rock, the gap has followed the velocities: errors are of second
+    order in the pair's own motion, fractions of a millimetre.
+    """
+    if n_rows < len(rows):
+        a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
+        r_a = get_rotation(rotations, a)
+        point = rotate(r_a, memory[row, MEMORY_POINT], memory[row, MEMORY_POINT + 1], memory[row, MEMORY_POINT + 2])
+        normal = rotate(
+            r_a, memory[row, MEMORY_NORMAL], memory[row, MEMORY_NORMAL + 1], memory[row, MEMORY_NORMAL + 2]
+        )
+        impulse = (
+            float(memory[row, MEMORY_IMPULSE]),
+            float(memory[row, MEMORY_IMPULSE + 1]),
+            float(memory[row, MEMORY_IMPULSE + 2]),
+        )
+        mu = 2.0 * friction[a] * friction[b] / (friction[a] + friction[b])
+        _write_row(
+            rows, n_rows, normal, point, positions, a, b, float(memory[row, MEMORY_GAP]), impulse, mu,
+            restitution[0], read_simplex(memory, row),
+        )  # fmt: skip
+        body_a[n_rows], body_b[n_rows] = solver_body[a], solver_body[b]
+        row_key[n_rows] = read_key(memory, row)
+        row_rock[n_rows] = a
+    return n_rows + 1
+
+
+@kernel
+def follow_contacts(
+    memory: Array,
+    active: Array,
+    n_active: int,
+    calm: Array,
+    positions: Array,
+    rotations: Array,
+    solver_body: Array,
+    friction: Array,
+    restitution: Array,
+    rows: Array,
+    body_a: Array,
+    body_b: Array,
+    row_key: Array,
+    row_rock: Array,
+) -> int:
+    """Set the rows of pairs of calm bodies from the memory: they follow the bodies' motion since the last search.
+
+    Args:
+        memory, active, n_active: loaded points of the last step and those about to touch, see `contacts`.
+        calm: per body CALM, COMOVING or SEARCHED, see `broad_phase`.
+        positions, rotations, solver_body, friction, restitution: as for `find_contacts`.
+        rows, body_a, body_b, row_key, row_rock: set, see `contacts`.
+
+    Returns:
+        number of rows; beyond the capacity they are counted but not stored.
+    """
+    n_rows = 0
+    for k in range(n_active):
+        row = active[k]
+        if calm[int(memory[row, MEMORY_FIRST])] == CALM and calm[int(memory[row, MEMORY_SECOND])] == CALM:
+            n_rows = _follow_row(
+                memory, row, positions, rotations, solver_body, friction, restitution, rows, body_a, body_b,
+                row_key, row_rock, n_rows,
+            )  # fmt: skip
+    return n_rows
+
+
+@kernel
+def _calc_own_speed(positions: Array, velocities: Array, a: int, b: int, radius_b: float) -> float:
+    """Return how fast rock b moves against rock a at most, seen from a, which turns [m/s]."""
+    v, w = velocities[a], velocities[b]
+    x, y, z = positions[b, 0] - positions[a, 0], positions[b, 1] - positions[a, 1], positions[b, 2] - positions[a, 2]
+    dx = w[3] - v[3] - (v[1] * z - v[2] * y)
+    dy = w[4] - v[4] - (v[2] * x - v[0] * z)
+    dz = w[5] - v[5] - (v[0] * y - v[1] * x)
+    spin2 = (w[0] - v[0]) ** 2 + (w[1] - v[1]) ** 2 + (w[2] - v[2]) ** 2
+    return math.sqrt(dx * dx + dy * dy + dz * dz) + radius_b * math.sqrt(spin2)
+
+
+@kernel
 def find_contacts(
     pair_a: Array,
     pair_b: Array,
@@ -172,6 +310,8 @@ def find_contacts(
     manifold_gap: float,
     face_cosine: float,
     max_points: int,
+    calm: Array,
+    slow_speed: float,
     memory: Array,
     table: Array,
     axis_keys: Array,
@@ -181,6 +321,7 @@ def find_contacts(
     body_b: Array,
     row_key: Array,
     row_rock: Array,
+    n_rows: int,
     statistics: Array,
     workspace: Workspace,
 ) -> int:
@@ -201,12 +342,15 @@ def find_contacts(
         restitution: (2,) rock against rock or site, rock against machine.
         time_step: [s]; pairs that can meet within it get contacts beforehand.
         margin: contacts are found up to this gap [m].
-        manifold_gap: further points of a pair up to this gap [m].
+        manifold_gap: further points of a pair up to this gap [m], or up to `margin` if the pair may close it in a step.
         face_cosine: see `make_manifold`.
         max_points: points of a pair, MAX_POINTS at most.
+        calm: per body CALM, COMOVING or SEARCHED, see `broad_phase`.
+        slow_speed: pairs of rocks that are not SEARCHED, slower than this against each other, follow [m/s].
         memory, table: loaded points of the last step, see `contacts`.
         axis_keys, axes: cache of separating axes: skips pairs, never changes a result.
         rows, body_a, body_b, row_key, row_rock: set, see `contacts`.
+        n_rows: number of rows before.
         statistics: (4,) set: pairs skipped, distances computed, overlapping cores, rows.
         workspace: from `make_workspace`.
 
@@ -215,7 +359,6 @@ def find_contacts(
     """
     gjk_workspace, manifold_workspace, all_points, known_points = workspace
     points = all_points[:max_points]
-    n_rows = 0
     statistics[:] = 0
     for pair in range(n_pairs):
         a, b = pair_a[pair], pair_b[pair]
@@ -229,6 +372,21 @@ def find_contacts(
         spin_a = math.sqrt(velocities[a, 0] ** 2 + velocities[a, 1] ** 2 + velocities[a, 2] ** 2)
         reach = math.sqrt(speed2) + spin_a * scale_a * shapes.radius[shape_a]
         remembered = find_in_memory(key, memory, table)
+        if (
+            remembered >= 0
+            and b < n_rocks
+            and calm[a] != SEARCHED
+            and calm[b] != SEARCHED
+            and _calc_own_speed(positions, velocities, a, b, scale[b] * shapes.radius[shape[b]]) < slow_speed
+        ):
+            row = remembered
+            while row < len(memory) and read_key(memory, row) == key:
+                n_rows = _follow_row(
+                    memory, row, positions, rotations, solver_body, friction, restitution, rows, body_a, body_b,
+                    row_key, row_rock, n_rows,
+                )  # fmt: skip
+                row += 1
+            continue
         # The direction in which the pair pushed last starts the search; where it did is preferred.
         hx, hy, hz = 0.0, 0.0, 0.0
         n_known = 0
@@ -238,7 +396,7 @@ def find_contacts(
                 hx += memory[row, MEMORY_IMPULSE]
                 hy += memory[row, MEMORY_IMPULSE + 1]
                 hz += memory[row, MEMORY_IMPULSE + 2]
-                if n_known < MAX_POINTS:
+                if n_known < MAX_POINTS and is_loaded(memory, row):
                     known_points[n_known, 0], known_points[n_known, 1], known_points[n_known, 2] = rotate(
                         r_a,
                         memory[row, MEMORY_POINT],
@@ -317,9 +475,11 @@ def find_contacts(
             shift = scale_a * shapes.rounding[shape_a] + 0.5 * gap
             points[0, 0], points[0, 1], points[0, 2] = ax + shift * nx, ay + shift * ny, az + shift * nz
             points[0, 3] = gap
+            # A face that is about to land, lands on all corners that it can reach within the step, or it would be spun.
+            further = max_gap if time_step * reach > manifold_gap else max(manifold_gap, gap)
             n_points = make_manifold(
                 shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, nx, ny, nz,
-                max(manifold_gap, gap), face_cosine, known_points, n_known, points, manifold_workspace,
+                further, face_cosine, known_points, n_known, points, manifold_workspace,
             )  # fmt: skip
             if b >= n_rocks and time_step * reach > FAST:
                 offset = nx * ax + ny * ay + nz * az + distance - scale_b * shapes.rounding[shape_b]
@@ -327,7 +487,6 @@ def find_contacts(
                     shapes, shape_a, scale_a, r_a, nx, ny, nz, offset, max_gap, points, n_points,
                     manifold_workspace[-1],
                 )  # fmt: skip
-        tx, ty, tz, ux, uy, uz = make_tangents(nx, ny, nz)
         mu = 2.0 * friction[a] * friction[b] / (friction[a] + friction[b])
         match_limit = 0.3 * scale_a * shapes.radius[shape_a]
         used = 0
@@ -336,7 +495,7 @@ def find_contacts(
                 n_rows += 1
                 continue
             x, y, z = points[k, 0], points[k, 1], points[k, 2]
-            normal, tangent_1, tangent_2 = 0.0, 0.0, 0.0
+            ix, iy, iz = 0.0, 0.0, 0.0
             if remembered >= 0:
                 lx, ly, lz = rotate_back(r_a, x, y, z)
                 nearest = match_limit * match_limit
@@ -355,26 +514,14 @@ def find_contacts(
                 if found >= 0:
                     used |= 1 << (found - remembered)
                     ix, iy, iz = (
-                        memory[found, MEMORY_IMPULSE],
-                        memory[found, MEMORY_IMPULSE + 1],
-                        memory[found, MEMORY_IMPULSE + 2],
+                        float(memory[found, MEMORY_IMPULSE]),
+                        float(memory[found, MEMORY_IMPULSE + 1]),
+                        float(memory[found, MEMORY_IMPULSE + 2]),
                     )
-                    normal = max(ix * nx + iy * ny + iz * nz, 0.0)
-                    tangent_1 = ix * tx + iy * ty + iz * tz
-                    tangent_2 = ix * ux + iy * uy + iz * uz
-            out = rows[n_rows]
-            out[NORMAL], out[NORMAL + 1], out[NORMAL + 2] = nx, ny, nz
-            out[TANGENT_1], out[TANGENT_1 + 1], out[TANGENT_1 + 2] = tx, ty, tz
-            out[TANGENT_2], out[TANGENT_2 + 1], out[TANGENT_2 + 2] = ux, uy, uz
-            out[ARM_A], out[ARM_A + 1], out[ARM_A + 2] = x, y, z
-            out[ARM_B] = x + positions[a, 0] - positions[b, 0]
-            out[ARM_B + 1] = y + positions[a, 1] - positions[b, 1]
-            out[ARM_B + 2] = z + positions[a, 2] - positions[b, 2]
-            out[FRICTION] = mu
-            out[GAP] = points[k, 3]
-            out[SIMPLEX] = simplex
-            out[RESTITUTION] = restitution[1] if body_2 > n_rocks else restitution[0]
-            out[IMPULSE], out[IMPULSE + 1], out[IMPULSE + 2] = normal, tangent_1, tangent_2
+            _write_row(
+                rows, n_rows, (nx, ny, nz), (x, y, z), positions, a, b, points[k, 3], (ix, iy, iz), mu,
+                restitution[1] if body_2 > n_rocks else restitution[0], simplex,
+            )  # fmt: skip
             body_a[n_rows], body_b[n_rows] = body_1, body_2
             row_key[n_rows] = key
             row_rock[n_rows] = a
