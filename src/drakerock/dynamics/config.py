@@ -22,7 +22,7 @@ class RestConfig(Config):
     speed: Annotated[float, Field(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
     mover_speed: Annotated[
         float, Field(gt=0, description="... and leans on none that is faster than this, a mover [m/s]")
-    ] = 0.001
+    ] = 0.0005
     wake_load: Annotated[
         float,
         Field(
@@ -40,7 +40,7 @@ class RestConfig(Config):
     recheck_period: Annotated[
         float,
         Field(gt=0, description="this often all that have moved since the start are woken together [s]"),
-    ] = 1.0
+    ] = 2.0
     sensor_length: Annotated[
         float, Field(ge=0, le=10, description="rocks this far in front of the bucket are awake [m]")
     ] = 2.0
@@ -54,7 +54,7 @@ class NonsmoothConfig(Config):
 
     iterations: Annotated[
         int, Field(ge=1, le=2000, description="least number of sweeps of the resting stage")
-    ] = 60
+    ] = 50
     tolerance: Annotated[
         float,
         Field(
@@ -114,7 +114,7 @@ class NonsmoothConfig(Config):
             le=20,
             description="contacts of slow rocks are searched every so many steps, and follow their motion between",
         ),
-    ] = 4
+    ] = 6
     slow_speed: Annotated[
         float, Field(ge=0, le=0.1, description="rocks are slow below this, their turning included [m/s]")
     ] = 0.02

@@ -1,9 +1,9 @@
 """Contact rows and the memory of contacts: what a contact point is, and how it is found again.
 
 Memory holds the loaded points of the last step, and those about to touch: the pair's key, the point in the frame of
-the pair's first rock, the impulse in W, where the search for the pair's nearest points ended, the contact's normal, and its gap
-after the step. It is what makes a stored pile start warm, what a resting pile's force network is kept in, and where
-contacts come from that are not searched in every step, those of calm rocks and of rocks that move together.
+the pair's first rock, the impulse in W, where the search for the pair's nearest points ended, the contact's normal,
+and its gap after the step. It is what makes a stored pile start warm, what a resting pile's force network is kept in,
+and where contacts come from that are not searched in every step, those of calm rocks and of rocks that move together.
 """
 
 from __future__ import annotations
@@ -41,6 +41,9 @@ MEMORY_SIMPLEX = 8  # 8..9, its lower and its upper bits
 MEMORY_NORMAL = 10  # 10..12 in the frame of the pair's first rock
 MEMORY_GAP = 13
 MEMORY_WIDTH = 14  # even: two numbers take the room of one of the context's
+
+# Points without load go into memory up to this share of its capacity, so that those with load find room.
+NEAR_SHARE = 0.875
 
 # A pair's key is first * KEY_STEP + second; bodies are below it, so they are exact in single precision.
 KEY_STEP = 1 << 20
@@ -159,7 +162,7 @@ def write_memory(
         rotations: (n, 3, 3) of the rocks at the poses of the solve.
         velocities: (n, 6) of the rocks over the step [rad/s, m/s].
         time_step: [s].
-        near_gap: points without load are kept up to this gap [m].
+        near_gap: points without load are kept up to this gap [m], while there is room.
         new: (capacity, MEMORY_WIDTH) set, as many rows as there are points.
 
     Returns:
@@ -180,10 +183,11 @@ def write_memory(
                 new[n_new, d] = old[row, d]
         n_new += 1
     n_idle = n_new
+    room_for_near = NEAR_SHARE * len(new)
     for k in range(n_rows):
         row = rows[k]
         normal, tangent_1, tangent_2 = row[IMPULSE], row[IMPULSE + 1], row[IMPULSE + 2]
-        if normal <= 0.0 and row[GAP] >= near_gap:
+        if normal <= 0.0 and (row[GAP] >= near_gap or n_new >= room_for_near):
             continue
         if n_new < len(new):
             a, b = row_rock[k], row_key[k] % KEY_STEP

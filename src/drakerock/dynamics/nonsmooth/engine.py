@@ -374,7 +374,7 @@ class NonsmoothEngine:
         return np.asarray(outside.any(axis=1))
 
     def place(self, arrays: RockArrays, rocks: IntArray, p_WRs: Array, V_WRs: Array) -> RockArrays:
-        """Return the state with rocks put at positions (m, 3) with velocities (m, 6), awake, their contacts forgotten."""
+        """Return the state with rocks put at positions (m, 3) with velocities (m, 6), awake, contacts forgotten."""
         pairs = arrays.memory[:, [contacts.MEMORY_FIRST, contacts.MEMORY_SECOND]]
         kept = ~np.isin(pairs, rocks).any(axis=1)
         new = replace(

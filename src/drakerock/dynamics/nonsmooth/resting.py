@@ -28,10 +28,13 @@ from drakerock.dynamics.nonsmooth.solver import (
 
 # Contacts of rocks that are at most this many rocks away from one that touches the machine are its neighbourhood.
 NEIGHBOURHOOD = 2
-# One in so many of the iterations is without momentum, the last ones.
-PLAIN = 10
-# Points that carry no load and, as bodies move now, will not touch within so many steps are idle: they are looked at in
-# one pair of sweeps of so many, and swept with the others from the first impulse on.
+# The last of the iterations are without momentum: one in so many, and at least so many.
+PLAIN_SHARE = 10
+LEAST_PLAIN = 10
+# Points without load away from the machine are idle if it takes this speed to close them within a step [m/s], and as
+# bodies move now they will not touch within so many steps. They are looked at in one pair of sweeps of so many, and
+# swept with the others from the first impulse on.
+IDLE_SPEED = 0.05
 IDLE_STEPS = 4.0
 IDLE_PERIOD = 5
 
@@ -90,10 +93,10 @@ def _make_all_batches(
     _mark_neighbourhood(n_free, n_rows, body_a, body_b, n_rocks, marks)
     chosen, group = np.empty(n_free, np.int64), np.empty(n_free, np.int64)
     for k in range(n_free):
-        if _is_idle(rows[k], bodies[body_a[k]], bodies[body_b[k]]):
-            group[k] = 2
-        elif marks[body_a[k]] > 0 or marks[body_b[k]] > 0:
+        if marks[body_a[k]] > 0 or marks[body_b[k]] > 0:
             group[k] = 0
+        elif _is_idle(rows[k], bodies[body_a[k]], bodies[body_b[k]]):
+            group[k] = 2
         else:
             group[k] = 1
     marks[:] = 0
@@ -127,7 +130,7 @@ def _choose_idle(batches: BatchArrays, first: int, last: int, every: bool, swept
 @kernel
 def _is_idle(row: Array, body_a: Array, body_b: Array) -> bool:
     """Return whether a point carries no load and will not touch within `IDLE_STEPS`."""
-    if row[IMPULSE] > 0.0 or row[BIAS] >= 0.0:
+    if row[IMPULSE] > 0.0 or row[BIAS] > -IDLE_SPEED:
         return False
     # Apart, the bias is the speed at which they meet within the step.
     return calc_normal_velocity(row, body_a, body_b) * IDLE_STEPS > row[BIAS]
@@ -213,7 +216,7 @@ def solve_resting(
     last_velocities = np.zeros((len(awake), WIDTH), np.float32)
     last_machine_impulses = np.zeros((n_rows - n_free, 3))
     last_motors, last_velocity = np.zeros((len(every_motor), 1)), np.zeros((1, len(velocity)))
-    first_plain = iterations - iterations // PLAIN
+    first_plain = iterations - min(max(iterations // PLAIN_SHARE, LEAST_PLAIN), iterations // 2)
     changed = 0.0
     iteration = 0
     swept = np.empty(n_batches - n_loaded, np.int64)

@@ -539,6 +539,15 @@ def sum_machine_impulses(
     return sums
 
 
+@kernel
+def _calc_approach(row: Array, a: int, b: int, bodies: Array, n_rocks: int, spatial: Array) -> float:
+    """Return how fast a row's points part; `spatial` holds the velocities of the machine's bodies [m/s]."""
+    if b <= n_rocks:
+        return calc_normal_velocity(row, bodies[a], bodies[b])
+    dx, dy, dz = _relative_velocity_machine(row, bodies[a], spatial[b - n_rocks - 1])
+    return float(row[NORMAL] * dx + row[NORMAL + 1] * dy + row[NORMAL + 2] * dz)
+
+
 @allocating_kernel
 def solve_impacts(
     rows: Array,
@@ -576,20 +585,17 @@ def solve_impacts(
     spatial = np.zeros((len(machine.jacobian), 6))
     for b in range(len(spatial)):
         _calc_body_velocity(machine, velocity, b, spatial[b])
-    approach = np.empty(n_rows)
     n_impacts = 0
     for k in range(n_rows):
         row = rows[k]
-        b = body_b[k]
-        if b > n_rocks:
-            dx, dy, dz = _relative_velocity_machine(row, bodies[body_a[k]], spatial[b - n_rocks - 1])
-        else:
-            dx, dy, dz = _relative_velocity(row, bodies[body_a[k]], bodies[b])
-        approach[k] = row[NORMAL] * dx + row[NORMAL + 1] * dy + row[NORMAL + 2] * dz
-        if row[RESTITUTION] > 0.0 and approach[k] < -threshold and row[GAP] + time_step * approach[k] < 0.0:
+        if row[RESTITUTION] <= 0.0:
+            continue
+        a, b = body_a[k], body_b[k]
+        approach = _calc_approach(row, a, b, bodies, n_rocks, spatial)
+        if approach < -threshold and row[GAP] + time_step * approach < 0.0:
             if n_impacts == 0:
                 marks[:] = 0
-            marks[body_a[k]] = 1
+            marks[a] = 1
             if b != n_rocks:
                 marks[b] = 1
             n_impacts += 1
@@ -602,17 +608,19 @@ def solve_impacts(
         row = rows[k]
         for d in range(3):
             impact_impulses[k, d] = 0.0
-        if marks[body_a[k]] == 0 and marks[body_b[k]] == 0:
+        a, b = body_a[k], body_b[k]
+        if marks[a] == 0 and marks[b] == 0:
             continue
+        approach = _calc_approach(row, a, b, bodies, n_rocks, spatial)
         # Not reached within the step; or without restitution and still apart: left to the resting stage.
-        if row[GAP] > 0.0 and (row[GAP] + time_step * approach[k] >= 0.0 or row[RESTITUTION] <= 0.0):
+        if row[GAP] > 0.0 and (row[GAP] + time_step * approach >= 0.0 or row[RESTITUTION] <= 0.0):
             continue
         for d in range(3):
             saved[n_chosen, d] = row[IMPULSE + d]
             row[IMPULSE + d] = 0.0
         saved[n_chosen, 3], saved[n_chosen, 4] = row[BIAS], row[COMPLIANCE]
         saved[n_chosen, 5] = row[NORMAL_MASS]
-        row[BIAS] = -row[RESTITUTION] * approach[k] if approach[k] < -threshold else 0.0
+        row[BIAS] = -row[RESTITUTION] * approach if approach < -threshold else 0.0
         # rigid
         if row[NORMAL_MASS] > 0.0:
             row[NORMAL_MASS] = 1.0 / (1.0 / row[NORMAL_MASS] - row[COMPLIANCE])

@@ -59,9 +59,8 @@ def test_broad_phase_finds_every_pair_of_boxes_that_meet(seed):
     rng = np.random.default_rng(seed)
     arrays.book[rng.random(len(pile)) < 0.4, reduction.STATUS] = 1  # some at rest
     status = arrays.book[:, reduction.STATUS].astype(np.int64)
-    awake = np.flatnonzero(status == 0)
     engine._pose(arrays, make_machineless_step(), status)
-    n_pairs = engine._find_pairs(status, awake)
+    n_pairs = engine._find_pairs(status)
     found = [
         (int(a), int(b)) for a, b in zip(engine._pair_a[:n_pairs], engine._pair_b[:n_pairs], strict=True)
     ]
@@ -529,7 +528,7 @@ def test_momentum_is_worth_many_sweeps():
         _, report = push_light_rocks(0.3, tolerance=1.0, **settings)
         return 0.3 - report.machine_velocity[0]
 
-    assert calc_brought(50, 0.8) > 2.5 * calc_brought(50, 0.0)
+    assert calc_brought(100, 0.8) > 2.5 * calc_brought(100, 0.0)
     assert calc_brought(200, 0.8) > 2.0 * calc_brought(300, 0.0)
     # It ends where plain sweeps do.
     assert calc_brought(2000, 0.8) == pytest.approx(calc_brought(2000, 0.0, machine_sweeps=7), rel=1e-3)

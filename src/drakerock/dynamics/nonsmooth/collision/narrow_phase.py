@@ -216,7 +216,9 @@ def _follow_row(
     if n_rows < len(rows):
         a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
         r_a = get_rotation(rotations, a)
-        point = rotate(r_a, memory[row, MEMORY_POINT], memory[row, MEMORY_POINT + 1], memory[row, MEMORY_POINT + 2])
+        point = rotate(
+            r_a, memory[row, MEMORY_POINT], memory[row, MEMORY_POINT + 1], memory[row, MEMORY_POINT + 2]
+        )
         normal = rotate(
             r_a, memory[row, MEMORY_NORMAL], memory[row, MEMORY_NORMAL + 1], memory[row, MEMORY_NORMAL + 2]
         )
@@ -279,7 +281,11 @@ def follow_contacts(
 def _calc_own_speed(positions: Array, velocities: Array, a: int, b: int, radius_b: float) -> float:
     """Return how fast rock b moves against rock a at most, seen from a, which turns [m/s]."""
     v, w = velocities[a], velocities[b]
-    x, y, z = positions[b, 0] - positions[a, 0], positions[b, 1] - positions[a, 1], positions[b, 2] - positions[a, 2]
+    x, y, z = (
+        positions[b, 0] - positions[a, 0],
+        positions[b, 1] - positions[a, 1],
+        positions[b, 2] - positions[a, 2],
+    )
     dx = w[3] - v[3] - (v[1] * z - v[2] * y)
     dy = w[4] - v[4] - (v[2] * x - v[0] * z)
     dz = w[5] - v[5] - (v[0] * y - v[1] * x)
