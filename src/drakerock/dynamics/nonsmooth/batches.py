@@ -148,17 +148,20 @@ def pack(rows: Array, body_a: Array, body_b: Array, still: int, batches: BatchAr
     """
     members, fields, bodies = batches.members, batches.fields, batches.bodies
     for n in range(n_batches):
-        for lane in range(LANES):
-            k = members[n, lane]
-            if k == NOBODY:
-                bodies[n, 0, lane], bodies[n, 1, lane] = still, still
-                for d in range(FIELDS):
-                    fields[n, d, lane] = 0.0
-                continue
-            bodies[n, 0, lane], bodies[n, 1, lane] = body_a[k], body_b[k]
-            for d in range(FIELD_TANGENT_STEP):
-                fields[n, d, lane] = rows[k, d]
-            fields[n, FIELD_TANGENT_STEP, lane] = rows[k, TANGENT_STEP]
+        size = 0
+        while size < LANES and members[n, size] != NOBODY:
+            k = members[n, size]
+            bodies[n, 0, size], bodies[n, 1, size] = body_a[k], body_b[k]
+            size += 1
+        for lane in range(size, LANES):
+            bodies[n, 0, lane], bodies[n, 1, lane] = still, still
+        # Field by field, so that memory is written in line.
+        for d in range(FIELDS):
+            column = d if d < FIELD_TANGENT_STEP else TANGENT_STEP
+            for lane in range(size):
+                fields[n, d, lane] = rows[members[n, lane], column]
+            for lane in range(size, LANES):
+                fields[n, d, lane] = 0.0
 
 
 @kernel

@@ -250,29 +250,32 @@ class MachineView(LeafSystem):
         values: list[list[float]],
     ) -> None:
         """Add three rows per contact of a machine body with the site: tyres on the floor, above all."""
+        numbers, axes, arms = [], [], []
         for pair in query.ComputePointPairPenetration():
             body_A, stiffness_A, mu_A = self._find_material(query, pair.id_A)
             body_B, stiffness_B, mu_B = self._find_material(query, pair.id_B)
             if (body_A is None) == (body_B is None):
                 continue
             # nhat_BA_W points out of B into A
-            normal = np.asarray(pair.nhat_BA_W)
-            number = body_A
-            if number is None:
-                normal, number = -normal, body_B
+            number, sign = (body_B, -1.0) if body_A is None else (body_A, 1.0)
             stiffness = stiffness_A * stiffness_B / (stiffness_A + stiffness_B)
             mu = 2.0 * mu_A * mu_B / (mu_A + mu_B)
-            arm = 0.5 * (np.asarray(pair.p_WCa) + np.asarray(pair.p_WCb)) - X_WBs[number][:3, 3]
-            J = jacobian[number, 3:] - _make_cross(arm) @ jacobian[number, :3]
-            tx, ty, tz, ux, uy, uz = make_tangents(*normal)
-            directions = np.array([normal, [tx, ty, tz], [ux, uy, uz]])
-            first = len(rows)
+            normal = [sign * part for part in pair.nhat_BA_W]
+            numbers.append(number)
+            axes.append([*normal, *make_tangents(*normal)])
+            arms.append(0.5 * (pair.p_WCa + pair.p_WCb) - X_WBs[number, :3, 3])
+            first = len(values)
             load = h * stiffness * pair.depth
             # Drake's regularised friction is full at the stiction tolerance.
             friction = [0.0, self._stiction_tolerance / (mu * load), -mu, mu, first]
-            rows.extend(directions @ J)
             values.append([pair.depth / h, 1.0 / (h * h * stiffness), 0.0, np.inf, -1])
             values.extend([friction, friction])
+        if numbers:
+            directions = np.array(axes).reshape(-1, 3, 3)
+            # A direction's velocity at an arm: along it, and about the arm.
+            turning = np.cross(np.array(arms)[:, None], directions)
+            spatial = np.concatenate([turning, directions], axis=2)
+            rows.extend((spatial @ jacobian[numbers]).reshape(-1, jacobian.shape[2]))
 
     def _find_material(self, query: QueryObject, geometry: object) -> tuple[int | None, float, float]:
         """Return a geometry's body number (None: not the machine's), point stiffness [N/m] and friction."""
@@ -343,8 +346,3 @@ def _find_damping(plant: MultibodyPlant) -> Array:
         start = joint.velocity_start()
         damping[start : start + joint.num_velocities()] = joint.default_damping_vector()
     return damping
-
-
-def _make_cross(arm: Array) -> Array:
-    x, y, z = arm
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
