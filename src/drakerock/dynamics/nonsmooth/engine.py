@@ -471,6 +471,7 @@ class NonsmoothEngine:
                 self.radius,
                 self.mass,
                 memory,
+                arrays.n_idle,
                 machine.sensors,
                 self._by_movers,
                 config.rest.wake_load * self.gravity * dt,

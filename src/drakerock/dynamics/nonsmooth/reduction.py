@@ -28,9 +28,9 @@ from drakerock.dynamics.nonsmooth.collision.broad_phase import (
 from drakerock.dynamics.nonsmooth.compiling import Array, allocating_kernel, kernel
 from drakerock.dynamics.nonsmooth.contacts import (
     MEMORY_FIRST,
+    MEMORY_IMPULSE,
     MEMORY_SECOND,
     is_loaded,
-    sum_impulses,
     sum_pressures,
 )
 
@@ -142,6 +142,7 @@ def wake(
     radius: Array,
     mass: Array,
     memory: Array,
+    n_idle: int,
     sensors: Array,
     by_movers: Array,
     load: float,
@@ -159,7 +160,7 @@ def wake(
         positions: (n, 3).
         radius: (n,) bounding spheres [m].
         mass: (n,) [kg].
-        memory: loaded contact points, see `contacts`.
+        memory, n_idle: see `mark_by_movers`.
         sensors: (k, 18) see `is_sensed`.
         by_movers: (n,) see `mark_by_movers`.
         load: change of the impulses' sum per mass above which a rock wakes, if it is above ... [m/s]
@@ -171,8 +172,8 @@ def wake(
         number of rocks woken.
     """
     n = len(book)
-    sums = np.empty((n, 3))
-    sum_impulses(memory, n, sums)
+    sums, touched = np.zeros((n, 3)), np.zeros(n, np.bool_)
+    _sum_where_touched(book, memory, n_idle, touched, sums)
     changed, pressures = np.zeros(n, np.bool_), np.empty(n)
     change2 = np.empty(n)
     for i in range(n):
@@ -182,6 +183,8 @@ def wake(
                 for d in range(3):
                     book[i, REFERENCE + d] = sums[i, d]
             change2[i] = 0.0
+            if not touched[i]:
+                continue
             for d in range(3):
                 change2[i] += (sums[i, d] - book[i, REFERENCE + d]) ** 2
             limit = load * mass[i] * (near if by_movers[i] else 1.0)
@@ -203,6 +206,34 @@ def wake(
             wake_rock(book, positions, i)
             n_woken += 1
     return n_woken
+
+
+@kernel
+def _sum_where_touched(book: Array, memory: Array, n_idle: int, touched: Array, sums: Array) -> None:
+    """Sum the contact impulses of the rocks that were solved, or touched one that was; others' have not changed.
+
+    Args:
+        book, memory, n_idle: see `wake`.
+        touched: (n,) bool, False before; set.
+        sums: (n, 3) zero before; added to for the rocks that are touched [N s].
+    """
+    n = len(book)
+    for row in range(n_idle, len(memory)):
+        touched[int(memory[row, MEMORY_FIRST])] = True
+        if memory[row, MEMORY_SECOND] < n:
+            touched[int(memory[row, MEMORY_SECOND])] = True
+    for row in range(len(memory)):
+        a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
+        if not touched[a] and (b >= n or not touched[b]):
+            continue
+        # What has left the site carries no more.
+        if book[a, STATUS] == LOST or (b < n and book[b, STATUS] == LOST):
+            continue
+        for d in range(3):
+            sums[a, d] -= memory[row, MEMORY_IMPULSE + d]
+        if b < n:
+            for d in range(3):
+                sums[b, d] += memory[row, MEMORY_IMPULSE + d]
 
 
 @kernel

@@ -18,7 +18,7 @@ from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.nonsmooth import contacts, motion, reduction, solver
 from drakerock.dynamics.nonsmooth import engine as engine_module
 from drakerock.dynamics.nonsmooth.collision import gjk
-from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, RESTING
+from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, LOST, RESTING
 from drakerock.dynamics.nonsmooth.engine import DEEP_SHARE, MachinePiece, MachineStep, make_machineless_step
 from drakerock.dynamics.nonsmooth.system import NonsmoothRocks
 from drakerock.errors import InputError, SimulationFailure
@@ -367,7 +367,18 @@ def test_the_sensor_wakes_what_is_in_its_box():
     box = np.concatenate([np.eye(3).reshape(-1), np.zeros(3), [-10, -10, -1], [0.0, 10, 10]])
     alone = np.zeros(len(book), np.bool_)
     n = reduction.wake(
-        book, arrays.positions, engine.radius, engine.mass, arrays.memory, box[None], alone, 0.1, 0.1, 0.1, 3
+        book,
+        arrays.positions,
+        engine.radius,
+        engine.mass,
+        arrays.memory,
+        0,
+        box[None],
+        alone,
+        0.1,
+        0.1,
+        0.1,
+        3,
     )
     inside = arrays.positions[:, 0] < engine.radius
     assert n == inside.sum()
@@ -681,7 +692,7 @@ def test_a_rock_under_pressure_wakes_by_a_share_of_it(squeeze, wakes):
     nowhere = np.zeros((0, 18))
     alone = np.zeros(1, np.bool_)
     n = reduction.wake(
-        book, np.zeros((1, 3)), np.ones(1), mass, memory, nowhere, alone, 0.3 * 9.81 * 0.01, 0.1, 0.1, 1
+        book, np.zeros((1, 3)), np.ones(1), mass, memory, 0, nowhere, alone, 0.3 * 9.81 * 0.01, 0.1, 0.1, 1
     )
     assert n == wakes
 
@@ -707,7 +718,7 @@ def test_a_rock_that_leans_on_a_mover_wakes_sooner_and_does_not_rest(mover):
     reduction.mark_by_movers(book, velocities, apart, 0, 0.01, unmarked)
     assert not unmarked.any()
     nowhere, limits = np.zeros((0, 18)), (0.3 * 9.81 * 0.01, 0.0, 0.1, 1)
-    reduction.wake(book, np.zeros((3, 3)), np.ones(3), mass, memory, nowhere, marks, *limits)
+    reduction.wake(book, np.zeros((3, 3)), np.ones(3), mass, memory, 0, nowhere, marks, *limits)
     np.testing.assert_array_equal(book[:, reduction.STATUS], [AWAKE, AWAKE if mover else RESTING, RESTING])
     # Long still, they may rest again, but not the one by the mover.
     book[:, reduction.STATUS], book[:, reduction.STILL_TIME] = AWAKE, 1.0
@@ -716,6 +727,24 @@ def test_a_rock_that_leans_on_a_mover_wakes_sooner_and_does_not_rest(mover):
         book, np.zeros((3, 3)), velocities, np.ones(3), nowhere, marks, 0.01, 1e-3, 0.1, 0.05, -far, far, True
     )
     np.testing.assert_array_equal(book[:, reduction.STATUS], [RESTING, AWAKE if mover else RESTING, RESTING])
+
+
+@pytest.mark.parametrize(
+    ("other", "n_idle", "wakes"), [(LOST, 0, True), (RESTING, 0, False), (LOST, 1, False)]
+)
+def test_a_rock_wakes_when_what_carried_it_has_left_the_site(other, n_idle, wakes):
+    """Rock 0 rests on rock 1. Contacts that were not solved in the last step cannot have changed, and are left out."""
+    weight = 100.0 * 9.81 * 0.01
+    memory = np.zeros((1, contacts.MEMORY_WIDTH), np.float32)
+    memory[0, contacts.MEMORY_SECOND], memory[0, contacts.MEMORY_IMPULSE + 2] = 1, -weight
+    book = np.zeros((2, reduction.BOOK_WIDTH))
+    book[:, reduction.STATUS] = RESTING, other
+    book[:, reduction.REFERENCE + 2] = np.float32(weight), -np.float32(weight)
+    nowhere, alone, limits = np.zeros((0, 18)), np.zeros(2, np.bool_), (0.3 * 9.81 * 0.01, 0.3, 0.1, 1)
+    n = reduction.wake(
+        book, np.zeros((2, 3)), np.ones(2), np.full(2, 100.0), memory, n_idle, nowhere, alone, *limits
+    )
+    assert n == wakes
 
 
 def test_all_that_have_moved_are_woken_together_from_time_to_time():
