@@ -250,14 +250,17 @@ class MachineView(LeafSystem):
         values: list[list[float]],
     ) -> None:
         """Add three rows per contact of a machine body with the site: tyres on the floor, above all."""
-        numbers, axes, arms = [], [], []
+        numbers: list[int] = []
+        axes: list[list[float]] = []
+        arms: list[Array] = []
         for pair in query.ComputePointPairPenetration():
             body_A, stiffness_A, mu_A = self._find_material(query, pair.id_A)
             body_B, stiffness_B, mu_B = self._find_material(query, pair.id_B)
             if (body_A is None) == (body_B is None):
                 continue
             # nhat_BA_W points out of B into A
-            number, sign = (body_B, -1.0) if body_A is None else (body_A, 1.0)
+            number, sign = (body_A, 1.0) if body_A is not None else (body_B, -1.0)
+            assert number is not None
             stiffness = stiffness_A * stiffness_B / (stiffness_A + stiffness_B)
             mu = 2.0 * mu_A * mu_B / (mu_A + mu_B)
             normal = [sign * part for part in pair.nhat_BA_W]
