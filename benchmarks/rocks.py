@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
@@ -208,6 +209,14 @@ def build_dig(
     return simulator, plant, machine, rocks
 
 
+def calc_bucket_mass(pile: PileState, masses: np.ndarray, plant: MultibodyPlant, context: Context) -> float:
+    """Return the mass of the rocks in the bucket's room, its heap included [kg]."""
+    X_WB = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName("bucket"))
+    local = (pile.p_WRs - X_WB.translation()) @ X_WB.rotation().matrix()
+    inside = ((local > [-0.2, -1.5, -0.5]) & (local < [2.1, 1.5, 2.3])).all(axis=1)
+    return float(masses[inside].sum())
+
+
 def run_dig(
     pile: PileState, rates: Rates, config: NonsmoothConfig, duration: float = 12.0, time_step: float = TIME_STEP,
     site: SiteConfig = SITE, y: float = 0.0,
@@ -218,7 +227,6 @@ def run_dig(
     root = simulator.get_mutable_context()
     context = rocks.GetMyContextFromRoot(root)
     plant_context = plant.GetMyContextFromRoot(root)
-    bucket = plant.GetBodyByName("bucket")
     rocks.get_report(root)  # loads the compiled kernels
     n_steps = round(duration / time_step)
     tip = plant.GetFrameByName("tip")
@@ -239,12 +247,6 @@ def run_dig(
         if k % 10 == 0:
             fastest = max(fastest, float(np.abs(rocks.get_pile(root).V_WRs[:, 3:]).max()))
     after = rocks.get_pile(root)
-    X_WB = plant.EvalBodyPoseInWorld(plant_context, bucket)
-    local = (after.p_WRs - X_WB.translation()) @ X_WB.rotation().matrix()
-    inside = (
-        (local[:, 0] > -0.2) & (local[:, 0] < 2.1) & (np.abs(local[:, 1]) < 1.5)
-        & (local[:, 2] > -0.5) & (local[:, 2] < 2.3)
-    )  # fmt: skip
     moved = np.linalg.norm(after.p_WRs - pile.p_WRs, axis=1)
     masses = rocks.engine.mass
     push = -forces[:, 3]
@@ -253,7 +255,7 @@ def run_dig(
     smooth = np.convolve(push, np.ones(window) / window, mode="valid")
     return {
         "cpu_s": cpu,
-        "bucket_mass_kg": float(masses[inside].sum()),
+        "bucket_mass_kg": calc_bucket_mass(after, masses, plant, plant_context),
         "peak_push_kN": float(smooth.max()) / 1e3,
         "mean_push_kN": float(push[: round(6.0 / time_step)].clip(0.0).mean()) / 1e3,
         "displaced_m3": float((masses * (moved > 0.05)).sum() / ROCKS.density),
