@@ -203,7 +203,7 @@ def solve_as_engine(
     start = time.process_time()
     _, n_sweeps = resting.solve_resting(
         rows, len(rows), body_a, body_b, awake, bodies, n_rocks, machine, velocity, iterations, most,
-        tolerance or 0.0, machine_sweeps, momentum, *scratch,
+        tolerance or 0.0, machine_sweeps, momentum, *scratch, 0.0,
     )  # fmt: skip
     return problem, time.process_time() - start, n_sweeps
 

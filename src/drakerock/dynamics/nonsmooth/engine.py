@@ -112,7 +112,7 @@ class StepReport:
         n_awake: rocks awake in the step.
         n_contacts: contact points; n_loaded of them carry load.
         n_sweeps: sweeps of the resting stage.
-        residual: the last one's change of the normal impulses over their sum.
+        residual: the last one's change of the normal impulses over their sum or the weight, see `solve_resting`.
         max_penetration, p99_penetration: of loaded points [m].
         n_woken, n_rested, n_lost: rocks that changed state (lost: left the site) in this step.
         redone: the step was solved again with more iterations.
@@ -527,6 +527,7 @@ class NonsmoothEngine:
             rows, n_rows, body_a, body_b, awake, self._bodies, n, machine.arrays, velocity,
             iterations, max(iterations, RETRY_FACTOR * config.iterations), config.tolerance,
             config.machine_sweeps, momentum, self._batches, self._bodies_32, self._marks,
+            float(self.mass[awake].sum()) * self.gravity * dt,
         )  # fmt: skip
 
         new.quaternions[:] = arrays.quaternions

@@ -164,6 +164,7 @@ def solve_resting(
     batches: BatchArrays,
     bodies_32: Array,
     marks: Array,
+    weight: float,
 ) -> tuple[float, int]:
     """The resting stage: symmetric sweeps, forwards and backwards in turn.
 
@@ -189,9 +190,11 @@ def solve_resting(
         batches: room for as many rows.
         bodies_32: (n_rocks + 1, BODY_WIDTH) float32 scratch; has to be zero and is left so.
         marks: (bodies of the solve,) scratch.
+        weight: of the awake rocks over the step [N s].
 
     Returns:
-        the residual, which is the last whole sweep's change of the normal impulses over their sum; the sweeps done.
+        the residual, which is the last whole sweep's change of the normal impulses over their sum, or over the weight
+        if that is more: what hardly touches may be off by much of little; the sweeps done.
     """
     free = np.empty((len(awake), 6))
     for s in range(len(awake)):
@@ -269,5 +272,5 @@ def solve_resting(
         # What is not awake stays zero: at rest, and immovable.
         bodies_32[awake[s]] = 0.0
     apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, np.zeros(len(velocity)))
-    total = sum_normal_impulses(rows, 0, n_rows)
+    total = max(sum_normal_impulses(rows, 0, n_rows), weight)
     return changed / total if total > 0.0 else 0.0, iteration
