@@ -166,7 +166,7 @@ def _write_row(
     b: int,
     gap: float,
     impulse: tuple[float, float, float],
-    mu: float,
+    friction: Array,
     restitution: float,
     simplex: int,
 ) -> None:
@@ -183,7 +183,7 @@ def _write_row(
     out[ARM_B] = x + positions[a, 0] - positions[b, 0]
     out[ARM_B + 1] = y + positions[a, 1] - positions[b, 1]
     out[ARM_B + 2] = z + positions[a, 2] - positions[b, 2]
-    out[FRICTION] = mu
+    out[FRICTION] = 2.0 * friction[a] * friction[b] / (friction[a] + friction[b])
     out[GAP] = gap
     out[SIMPLEX] = simplex
     out[RESTITUTION] = restitution
@@ -227,9 +227,8 @@ def _follow_row(
             float(memory[row, MEMORY_IMPULSE + 1]),
             float(memory[row, MEMORY_IMPULSE + 2]),
         )
-        mu = 2.0 * friction[a] * friction[b] / (friction[a] + friction[b])
         _write_row(
-            rows, n_rows, normal, point, positions, a, b, float(memory[row, MEMORY_GAP]), impulse, mu,
+            rows, n_rows, normal, point, positions, a, b, float(memory[row, MEMORY_GAP]), impulse, friction,
             restitution[0], read_simplex(memory, row),
         )  # fmt: skip
         body_a[n_rows], body_b[n_rows] = solver_body[a], solver_body[b]
@@ -493,7 +492,6 @@ def find_contacts(
                     shapes, shape_a, scale_a, r_a, nx, ny, nz, offset, max_gap, points, n_points,
                     manifold_workspace[-1],
                 )  # fmt: skip
-        mu = 2.0 * friction[a] * friction[b] / (friction[a] + friction[b])
         match_limit = 0.3 * scale_a * shapes.radius[shape_a]
         used = 0
         for k in range(n_points):
@@ -525,7 +523,7 @@ def find_contacts(
                         float(memory[found, MEMORY_IMPULSE + 2]),
                     )
             _write_row(
-                rows, n_rows, (nx, ny, nz), (x, y, z), positions, a, b, points[k, 3], (ix, iy, iz), mu,
+                rows, n_rows, (nx, ny, nz), (x, y, z), positions, a, b, points[k, 3], (ix, iy, iz), friction,
                 restitution[1] if body_2 > n_rocks else restitution[0], simplex,
             )  # fmt: skip
             body_a[n_rows], body_b[n_rows] = body_1, body_2
