@@ -22,7 +22,7 @@ class RestConfig(Config):
     speed: Annotated[float, Field(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
     mover_speed: Annotated[
         float, Field(gt=0, description="... and leans on none that is faster than this, a mover [m/s]")
-    ] = 0.0005
+    ] = 0.001
     wake_load: Annotated[
         float,
         Field(
@@ -52,17 +52,7 @@ class RestConfig(Config):
 class NonsmoothConfig(Config):
     """The nonsmooth engine: stepper, contact solve, collision margins, reduction."""
 
-    iterations: Annotated[
-        int, Field(ge=1, le=2000, description="least number of sweeps of the resting stage")
-    ] = 50
-    tolerance: Annotated[
-        float,
-        Field(
-            ge=0,
-            le=1,
-            description="sweeps go on, up to four times as many, until one changes the machine's forces by less",
-        ),
-    ] = 3e-4
+    iterations: Annotated[int, Field(ge=1, le=2000, description="sweeps of the resting stage")] = 50
     machine_sweeps: Annotated[
         int, Field(ge=0, le=100, description="further sweeps per sweep over the contacts around the machine")
     ] = 1
@@ -107,12 +97,22 @@ class NonsmoothConfig(Config):
     contact_margin: Annotated[
         float, Field(gt=0, le=0.2, description="contacts are found this far ahead of touching [m]")
     ] = 0.005
+    search_distance: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=0.01,
+            description="contacts of slow rocks are searched after this way, their turning included, and follow their "
+            "motion between [m]",
+        ),
+    ] = 0.001
     search_period: Annotated[
         int,
         Field(
             ge=1,
             le=20,
-            description="contacts of slow rocks are searched every so many steps, and follow their motion between",
+            description="contacts of faster rocks that move together are searched every so many steps (1: all contacts "
+            "are searched in every step)",
         ),
     ] = 6
     slow_speed: Annotated[

@@ -36,10 +36,9 @@ _log = logging.getLogger(__name__)
 GRAVITY = 9.81
 # How far outside the site's box a rock still counts as inside [m].
 SITE_MARGIN = 0.5
-# Sweeps that the machine's forces ask for are at most this many times the iterations. A step that failed is solved
-# again with as many and without momentum, from a cold start if need be; one that begins with an overlap beyond this
-# share of the bound has them at once. A light rock that the machine presses into a jammed pile passes on little of the
-# machine's momentum per iteration, and is squeezed meanwhile.
+# A step that failed is solved again with this many times the iterations and without momentum, from a cold start if need
+# be; one that begins with an overlap beyond this share of the bound has as many at once. A light rock that the machine
+# presses into a jammed pile passes on little of the machine's momentum per iteration, and is squeezed meanwhile.
 RETRY_FACTOR = 4
 DEEP_SHARE = 0.375
 
@@ -264,7 +263,9 @@ class NonsmoothEngine:
         self._statistics = np.zeros(4, np.int64)
         self._narrow_workspace = narrow_phase.make_workspace()
         self._by_movers = np.zeros(n, np.bool_)
+        # What is no rock does not move, or is searched with what does.
         self._calm = np.full(n_bodies, broad_phase.SEARCHED, np.int8)
+        self._calm[n : self.first_piece] = broad_phase.CALM
         self._seeks = np.zeros(n, np.bool_)
         self._cell_start = np.zeros(2, np.int64)
         self._allocate_pairs(20 * n + 256)
@@ -308,6 +309,8 @@ class NonsmoothEngine:
         book = np.zeros((n, reduction.BOOK_WIDTH))
         book[:, reduction.STATUS] = np.where(self.fixed, FIXED, AWAKE)
         book[:, reduction.ANCHOR : reduction.ANCHOR + 3] = pile.p_WRs
+        # A pile's contacts don't tell normals and gaps.
+        book[:, reduction.WAY] = np.inf
         memory = np.zeros((0, contacts.MEMORY_WIDTH), np.float32)
         if pile.contacts is not None:
             memory = self._make_memory(pile.contacts)
@@ -442,7 +445,7 @@ class NonsmoothEngine:
         if better.residual > self.config.max_residual:
             raise SimulationFailure(
                 f"rocks: the contact solve did not converge: residual {better.residual:.2g} after "
-                f"{RETRY_FACTOR * iterations} iterations or more (max_residual {self.config.max_residual:g})"
+                f"{better.n_sweeps} iterations (max_residual {self.config.max_residual:g})"
             )
         return again, _mark_redone(better)
 
@@ -485,13 +488,12 @@ class NonsmoothEngine:
             reduction.wake_all(book, arrays.positions, False)
         status = book[:, reduction.STATUS].astype(np.int64)
         awake = np.flatnonzero(status == AWAKE)
-        follow = not search_all and arrays.steps % config.search_period != 0
-        self._calm[: self.first_piece] = broad_phase.CALM if follow else broad_phase.SEARCHED
-        if follow:
-            reduction.mark_calm(
-                arrays.book, status, arrays.positions, arrays.velocities, self.radius, machine.sensors,
-                config.slow_speed, self._calm,
-            )  # fmt: skip
+        search_all = search_all or config.search_period == 1
+        reduction.mark_calm(
+            book, arrays.positions, arrays.velocities, self.radius, machine.sensors, dt, config.slow_speed,
+            -1.0 if search_all else config.search_distance, search_all or arrays.steps % config.search_period == 0,
+            self._calm,
+        )  # fmt: skip
         self._velocities[:n] = arrays.velocities
         self._velocities[n + 1 :] = machine.arrays.jacobian @ machine.velocity
         self._pose(arrays, machine, status)
@@ -523,10 +525,9 @@ class NonsmoothEngine:
             solver.damp_spin(rows, n_rows, body_a, body_b, self._bodies, n, config.spin_damping * dt)
         motion.add_gravity(awake, self._bodies, np.array([0.0, 0.0, -self.gravity * dt]))
         velocity += machine.free_change
-        residual, n_sweeps = resting.solve_resting(
+        residual = resting.solve_resting(
             rows, n_rows, body_a, body_b, awake, self._bodies, n, machine.arrays, velocity,
-            iterations, max(iterations, RETRY_FACTOR * config.iterations), config.tolerance,
-            config.machine_sweeps, momentum, self._batches, self._bodies_32, self._marks,
+            iterations, config.machine_sweeps, momentum, self._batches, self._bodies_32, self._marks,
             float(self.mass[awake].sum()) * self.gravity * dt,
         )  # fmt: skip
 
@@ -550,7 +551,7 @@ class NonsmoothEngine:
         n_memory, n_idle = contacts.write_memory(
             n, status, memory, self._active, n_active, rows, n_rows, self._row_key,
             self._row_rock, self._rotations, new.velocities, dt,
-            2.0 * config.slow_speed * dt * (config.search_period - 1), new.memory,
+            2.0 * config.search_distance, new.memory,
         )  # fmt: skip
         new.memory, new.n_idle = new.memory[:n_memory], n_idle
         if config.reduction == "rest":
@@ -574,7 +575,7 @@ class NonsmoothEngine:
             n_awake=len(awake),
             n_contacts=n_rows,
             n_loaded=int(loaded.sum()),
-            n_sweeps=n_sweeps,
+            n_sweeps=iterations,
             residual=residual,
             max_penetration=max_penetration,
             p99_penetration=float(_calc_percentile(depths, 0.99)),

@@ -16,15 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drakerock.dynamics.nonsmooth.collision.broad_phase import (
-    AWAKE,
-    CALM,
-    COMOVING,
-    FIXED,
-    LOST,
-    RESTING,
-    SEARCHED,
-)
+from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, CALM, COMOVING, LOST, RESTING, SEARCHED
 from drakerock.dynamics.nonsmooth.compiling import Array, allocating_kernel, kernel
 from drakerock.dynamics.nonsmooth.contacts import (
     MEMORY_FIRST,
@@ -44,7 +36,8 @@ CHANGED_STEPS = 1
 REFERENCE = 2  # 2..4 sum of its contact impulses when it came to rest [N s]
 # of both
 MOVED = 5  # 1: it has moved since the start
-BOOK_WIDTH = 6
+WAY = 6  # how far it has moved since its contacts were searched, its turning included [m]
+BOOK_WIDTH = 7
 
 # In CHANGED_STEPS: the rock has just come to rest, its reference is not set yet.
 NEW = -1.0
@@ -102,37 +95,49 @@ def _moves(book: Array, velocities: Array, i: int, speed: float) -> bool:
 @kernel
 def mark_calm(
     book: Array,
-    status: Array,
     positions: Array,
     velocities: Array,
     radius: Array,
     sensors: Array,
+    time_step: float,
     slow_speed: float,
+    distance: float,
+    search_fast: bool,
     calm: Array,
 ) -> None:
     """Mark the rocks whose contacts need no search in this step: slow ones, and those that do not move at all.
 
-    Fast ones are COMOVING. All contacts are searched of rocks that are just woken, as what they touch may have moved
-    meanwhile, and of those in the sensor, which the bucket may strike in the next step.
+    All contacts are searched of rocks that are just woken, as what they touch may have moved meanwhile, and of those in
+    the sensor, which the bucket may strike in the next step.
 
     Args:
-        book: (n, BOOK_WIDTH) before the step.
-        status: (n,) in the step.
+        book: (n, BOOK_WIDTH), changed: the way of each rock.
         positions, velocities, radius, sensors: see `wake` and `is_sensed`.
+        time_step: [s].
         slow_speed: below it rocks are slow, their turning at their bounding spheres included [m/s].
+        distance: slow rocks are searched when they will have moved this far since the last time [m]; below 0: always.
+        search_fast: whether the others, which else are COMOVING, are searched too.
         calm: (n,) at least, set: CALM, COMOVING or SEARCHED.
     """
     for i in range(len(book)):
-        calm[i] = CALM if status[i] == RESTING or status[i] == FIXED else SEARCHED
+        calm[i] = SEARCHED if book[i, STATUS] == LOST else CALM
+        if book[i, STATUS] != AWAKE:
+            continue
+        v = velocities[i]
+        spin = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+        speed = np.sqrt(v[3] * v[3] + v[4] * v[4] + v[5] * v[5]) + radius[i] * spin
+        book[i, WAY] += time_step * speed
+        slow = speed < slow_speed
         if (
-            status[i] == AWAKE
-            and book[i, STATUS] == AWAKE
-            and not is_sensed(positions[i, 0], positions[i, 1], positions[i, 2], radius[i], sensors)
+            (search_fast and not slow)
+            or (slow and book[i, WAY] + time_step * speed > distance)
+            or book[i, WAY] == np.inf
+            or is_sensed(positions[i, 0], positions[i, 1], positions[i, 2], radius[i], sensors)
         ):
-            v = velocities[i]
-            spin = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-            speed = np.sqrt(v[3] * v[3] + v[4] * v[4] + v[5] * v[5])
-            calm[i] = CALM if speed + radius[i] * spin < slow_speed else COMOVING
+            calm[i] = SEARCHED
+            book[i, WAY] = 0.0
+        elif not slow:
+            calm[i] = COMOVING
 
 
 @allocating_kernel
@@ -241,6 +246,7 @@ def wake_rock(book: Array, positions: Array, i: int) -> None:
     """Make one rock awake."""
     book[i, STATUS] = AWAKE
     book[i, STILL_TIME] = 0.0
+    book[i, WAY] = np.inf
     for d in range(3):
         book[i, ANCHOR + d] = positions[i, d]
 

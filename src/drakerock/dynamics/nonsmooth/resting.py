@@ -157,22 +157,19 @@ def solve_resting(
     machine: MachineArrays,
     velocity: Array,
     iterations: int,
-    max_iterations: int,
-    tolerance: float,
     machine_sweeps: int,
     momentum: float,
     batches: BatchArrays,
     bodies_32: Array,
     marks: Array,
     weight: float,
-) -> tuple[float, int]:
+) -> float:
     """The resting stage: symmetric sweeps, forwards and backwards in turn.
 
-    They go on until the forces on the machine have settled, which takes longest where it presses on a jam. Each is
-    followed by `machine_sweeps` over the machine's own rows, its contacts and their neighbourhood. A light rock that
-    the machine presses on others passes on little of the machine's momentum per sweep. After every second one all are
-    continued on their way, see `momentum`; but for the last tenth of `iterations`, in which what goes to and fro with
-    momentum comes to an end. Points that carry no load, and are not about to, are left out of most sweeps.
+    Each is followed by `machine_sweeps` over the machine's own rows, its contacts and their neighbourhood. A light rock
+    that the machine presses on others passes on little of the machine's momentum per sweep. After every second one all
+    are continued on their way, see `momentum`; but for the last tenth of `iterations`, in which what goes to and fro
+    with momentum comes to an end. Points that carry no load, and are not about to, are left out of most sweeps.
 
     The sweeps over the rocks run in single precision; the velocities are then made anew from the impulses in
     double precision, so that momentum is kept to rounding.
@@ -183,8 +180,7 @@ def solve_resting(
         awake: (m,) rocks that can move.
         bodies, machine, velocity: with gravity and free velocities, without the warm start; changed.
         n_rocks: see `prepare_rows`.
-        iterations, max_iterations: least and greatest number of sweeps over all contacts.
-        tolerance: sweeps end when one changes the normal impulses on the machine by less than this share of their sum.
+        iterations: number of sweeps over all contacts.
         machine_sweeps: further sweeps about the machine after each.
         momentum: at most this share of two sweeps' change is added to them, see `momentum`; 0: none.
         batches: room for as many rows.
@@ -194,7 +190,7 @@ def solve_resting(
 
     Returns:
         the residual, which is the last whole sweep's change of the normal impulses over their sum, or over the weight
-        if that is more: what hardly touches may be off by much of little; the sweeps done.
+        if that is more: what hardly touches may be off by much of little.
     """
     free = np.empty((len(awake), 6))
     for s in range(len(awake)):
@@ -221,11 +217,9 @@ def solve_resting(
     last_motors, last_velocity = np.zeros((len(every_motor), 1)), np.zeros((1, len(velocity)))
     first_plain = iterations - min(max(iterations // PLAIN_SHARE, LEAST_PLAIN), iterations // 2)
     changed = 0.0
-    iteration = 0
     swept = np.empty(n_batches - n_loaded, np.int64)
     n_swept = 0
-    while iteration < max_iterations:
-        settled = False
+    for iteration in range(iterations):
         if iteration % 2 == 0:
             n_swept = _choose_idle(batches, n_loaded, n_batches, (iteration // 2) % IDLE_PERIOD == 0, swept)
         for sweep in range(1 + machine_sweeps):
@@ -253,13 +247,9 @@ def solve_resting(
                     solve_batch(batches, k, bodies_32)
             if sweep == 0:
                 changed = change + float(batches.changes.sum())
-                settled = change <= tolerance * sum_normal_impulses(rows, n_free, n_rows)
-        iteration += 1
-        if settled and iteration >= iterations:
-            break
-        if momentum > 0.0 and iteration % 2 == 0 and iteration < max_iterations:
-            plain = first_plain <= iteration < iterations + 2
-            share = 0.0 if plain else calc_share(iteration // 2 - 1, momentum)
+        done = iteration + 1
+        if momentum > 0.0 and done % 2 == 0 and done < iterations:
+            share = 0.0 if done >= first_plain else calc_share(done // 2 - 1, momentum)
             go_on_in_lanes(fields, every_batch, IMPULSE * LANES, last_impulses, share)
             go_on_in_lanes(bodies_32, awake, 0, last_velocities, share)
             go_on(rows, forwards, IMPULSE, last_machine_impulses, share)
@@ -273,4 +263,4 @@ def solve_resting(
         bodies_32[awake[s]] = 0.0
     apply_impulses(rows, n_rows, body_a, body_b, bodies, n_rocks, machine, np.zeros(len(velocity)))
     total = max(sum_normal_impulses(rows, 0, n_rows), weight)
-    return changed / total if total > 0.0 else 0.0, iteration
+    return changed / total if total > 0.0 else 0.0

@@ -247,8 +247,8 @@ def test_contacts_of_slow_rocks_follow_their_motion():
     rng = np.random.default_rng(0)
     arrays.book[:, reduction.STATUS] = AWAKE
     arrays.velocities[:, 3:] += rng.uniform(-4e-3, 4e-3, (engine.n_rocks, 3))
-    arrays.steps = 0
-    engine.config = NonsmoothConfig(reduction="none", search_period=5)
+    arrays.book[:, reduction.WAY] = np.inf
+    engine.config = NonsmoothConfig(reduction="none")
     searched = []
     for _ in range(4):
         arrays, _ = engine.advance(arrays)
@@ -505,7 +505,7 @@ def test_sweeps_around_the_machine_bring_its_momentum_through_light_rocks():
     left = {}
     for sweeps, iterations in ((0, 50), (3, 50), (0, 200), (0, 2000)):
         engine, report = push_light_rocks(
-            0.3, machine_sweeps=sweeps, iterations=iterations, tolerance=1.0, momentum=0.0
+            0.3, machine_sweeps=sweeps, iterations=iterations, momentum=0.0
         )
         left[sweeps, iterations] = report.machine_velocity[0]
         # what the rocks got is what the machine lost, however many sweeps there were
@@ -518,25 +518,10 @@ def test_sweeps_around_the_machine_bring_its_momentum_through_light_rocks():
     assert brought[3, 50] == pytest.approx(brought[0, 200], rel=0.15)
 
 
-def test_sweeps_go_on_until_the_forces_on_the_machine_have_settled():
-    _, converged = push_light_rocks(0.3, iterations=2000, tolerance=1.0)
-    brought = 0.3 - converged.machine_velocity[0]
-    errors, sweeps = [], []
-    for tolerance in (1.0, 3e-2, 3e-3):
-        _, report = push_light_rocks(0.3, iterations=5, tolerance=tolerance)
-        errors.append(abs(0.3 - report.machine_velocity[0] - brought) / brought)
-        sweeps.append(report.n_sweeps)
-    assert sweeps[0] == 5
-    assert 5 < sweeps[1] < sweeps[2] == 20  # four times as many at most
-    assert errors[2] < errors[1] < errors[0]
-    # Nothing pushes: no sweep more than the least.
-    assert push_light_rocks(-0.3, iterations=5, tolerance=1e-6)[1].n_sweeps == 5
-
-
 def test_momentum_is_worth_many_sweeps():
     def calc_brought(iterations, momentum, machine_sweeps=0):
         settings = {"iterations": iterations, "momentum": momentum, "machine_sweeps": machine_sweeps}
-        _, report = push_light_rocks(0.3, tolerance=1.0, **settings)
+        _, report = push_light_rocks(0.3, **settings)
         return 0.3 - report.machine_velocity[0]
 
     assert calc_brought(100, 0.8) > 2.5 * calc_brought(100, 0.0)
