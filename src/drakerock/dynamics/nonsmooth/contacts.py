@@ -9,6 +9,10 @@ and where contacts come from that are not searched in every step, those of calm 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from drakerock.dynamics.nonsmooth.compiling import Array, kernel
 
@@ -48,6 +52,29 @@ NEAR_SHARE = 0.875
 # A pair's key is first * KEY_STEP + second; bodies are below it, so they are exact in single precision.
 KEY_STEP = 1 << 20
 SIMPLEX_STEP = 1 << 22
+
+
+class ContactRows(NamedTuple):
+    """Room for contact rows (capacity n).
+
+    Attributes:
+        values: (n, ROW_WIDTH).
+        body_a, body_b: (n,) the bodies of the solve that each row is between.
+        key: (n,) its pair's key, see `read_key`.
+        rock: (n,) its pair's first rock.
+    """
+
+    values: NDArray[np.float64]
+    body_a: NDArray[np.int64]
+    body_b: NDArray[np.int64]
+    key: NDArray[np.int64]
+    rock: NDArray[np.int64]
+
+
+def make_contact_rows(capacity: int) -> ContactRows:
+    """Return room for so many rows."""
+    numbers = [np.zeros(capacity, np.int64) for _ in range(4)]
+    return ContactRows(np.zeros((capacity, ROW_WIDTH)), *numbers)
 
 
 @kernel
@@ -140,10 +167,8 @@ def write_memory(
     old: Array,
     active: Array,
     n_active: int,
-    rows: Array,
+    rows: ContactRows,
     n_rows: int,
-    row_key: Array,
-    row_rock: Array,
     rotations: Array,
     velocities: Array,
     time_step: float,
@@ -158,7 +183,6 @@ def write_memory(
         old: memory of the last step.
         active, n_active: its rows that were looked up, see `index_memory`; the others are kept.
         rows, n_rows: contact rows after the solve.
-        row_key, row_rock: per row the pair's key and its first rock.
         rotations: (n, 3, 3) of the rocks at the poses of the solve.
         velocities: (n, 6) of the rocks over the step [rad/s, m/s].
         time_step: [s].
@@ -185,13 +209,13 @@ def write_memory(
     n_idle = n_new
     room_for_near = NEAR_SHARE * len(new)
     for k in range(n_rows):
-        row = rows[k]
+        row = rows.values[k]
         normal, tangent_1, tangent_2 = row[IMPULSE], row[IMPULSE + 1], row[IMPULSE + 2]
         if normal <= 0.0 and (row[GAP] >= near_gap or n_new >= room_for_near):
             continue
         if n_new < len(new):
-            a, b = row_rock[k], row_key[k] % KEY_STEP
-            new[n_new, MEMORY_FIRST], new[n_new, MEMORY_SECOND] = row_key[k] // KEY_STEP, b
+            a, b = rows.rock[k], rows.key[k] % KEY_STEP
+            new[n_new, MEMORY_FIRST], new[n_new, MEMORY_SECOND] = rows.key[k] // KEY_STEP, b
             approach = _calc_approach(velocities[a], row, ARM_A)
             if b < n_rocks:
                 approach -= _calc_approach(velocities[b], row, ARM_B)

@@ -206,21 +206,24 @@ class NonsmoothEngine:
         n_bodies = self.first_piece + len(pieces)
         if n_bodies >= contacts.KEY_STEP:
             raise ValueError(f"{n_bodies} bodies: more than {contacts.KEY_STEP - 1} cannot be told apart")
-        self.shape = np.zeros(n_bodies, np.int64)
-        self.shape[:n] = self.shape_index
-        self.shape[n : self.first_plane] = n_shapes + np.arange(n_static)
-        self.shape[self.first_piece :] = n_shapes + n_static + np.arange(len(pieces))
-        self.scale = np.ones(n_bodies)
-        self.scale[:n] = self.size
-        self.friction = np.full(n_bodies, site.config.friction)
-        self.friction[:n] = rocks.friction
-        self.friction[self.first_piece :] = [piece.friction for piece in pieces]
-        self.restitution = np.array([rocks.restitution, rocks.restitution_machine])
         self.piece_body = np.array([piece.body for piece in pieces], np.int64)
+        shape = np.zeros(n_bodies, np.int64)
+        shape[:n] = self.shape_index
+        shape[n : self.first_plane] = n_shapes + np.arange(n_static)
+        shape[self.first_piece :] = n_shapes + n_static + np.arange(len(pieces))
+        scale = np.ones(n_bodies)
+        scale[:n] = self.size
+        friction = np.full(n_bodies, site.config.friction)
+        friction[:n] = rocks.friction
+        friction[self.first_piece :] = [piece.friction for piece in pieces]
+        solver_body = np.full(n_bodies, n, np.int64)
+        solver_body[:n] = np.arange(n)
+        solver_body[self.first_piece :] = n + 1 + self.piece_body
+        self._collision_bodies = narrow_phase.CollisionBodies(
+            shape, scale, np.zeros((n_bodies, 3)), np.tile(np.eye(3), (n_bodies, 1, 1)), solver_body, friction
+        )
+        self.restitution = np.array([rocks.restitution, rocks.restitution_machine])
         self.n_machine_bodies = n_machine_bodies
-        self.solver_body = np.full(n_bodies, n, np.int64)
-        self.solver_body[:n] = np.arange(n)
-        self.solver_body[self.first_piece :] = n + 1 + self.piece_body
 
         # Masses and inertias of the true shapes, not of the rounded ones.
         volume = np.array([item.volume for item in shapes])
@@ -242,8 +245,6 @@ class NonsmoothEngine:
     def _make_scratch(self, n_bodies: int) -> None:
         n = self.n_rocks
         self.capacity = self.config.memory_per_rock * n + 1024
-        self._positions = np.zeros((n_bodies, 3))
-        self._rotations = np.tile(np.eye(3), (n_bodies, 1, 1))
         self._lower = np.full((n_bodies, 3), np.inf)
         self._upper = np.full((n_bodies, 3), -np.inf)
         self._inverse_inertia = np.zeros((n, 6))
@@ -271,7 +272,7 @@ class NonsmoothEngine:
         self._allocate_pairs(20 * n + 256)
         self._allocate_rows(6 * n + 256)
         for k in range(n, self.first_plane):
-            vertices = self._get_vertices(self.shape[k])
+            vertices = self._get_vertices(self._collision_bodies.shape[k])
             self._lower[k], self._upper[k] = vertices.min(axis=0), vertices.max(axis=0)
 
     def _get_vertices(self, shape: int) -> Array:
@@ -283,11 +284,7 @@ class NonsmoothEngine:
         self._pair_b = np.zeros(capacity, np.int64)
 
     def _allocate_rows(self, capacity: int) -> None:
-        self._rows = np.zeros((capacity, contacts.ROW_WIDTH))
-        self._body_a = np.zeros(capacity, np.int64)
-        self._body_b = np.zeros(capacity, np.int64)
-        self._row_key = np.zeros(capacity, np.int64)
-        self._row_rock = np.zeros(capacity, np.int64)
+        self._rows = contacts.make_contact_rows(capacity)
         self._impacts = np.zeros((capacity, 3))
         self._batches = make_batch_arrays(capacity)
 
@@ -502,7 +499,7 @@ class NonsmoothEngine:
         n_pairs = self._find_pairs(status)
         places, n_active = contacts.index_memory(memory, n, status, self._active, self._table)
         n_rows = self._find_contacts(n_pairs, memory, self._table[:places], n_active)
-        rows, body_a, body_b = self._rows, self._body_a, self._body_b
+        rows, body_a, body_b, *_ = self._rows
         if -rows[:n_rows, contacts.GAP].min(initial=0.0) > DEEP_SHARE * config.max_penetration:
             iterations *= RETRY_FACTOR
         if not warm:
@@ -549,8 +546,8 @@ class NonsmoothEngine:
             self._bodies_32[:] = 0.0
             return None, None
         n_memory, n_idle = contacts.write_memory(
-            n, status, memory, self._active, n_active, rows, n_rows, self._row_key,
-            self._row_rock, self._rotations, new.velocities, dt,
+            n, status, memory, self._active, n_active, self._rows, n_rows,
+            self._collision_bodies.rotations, new.velocities, dt,
             2.0 * config.search_distance, new.memory,
         )  # fmt: skip
         new.memory, new.n_idle = new.memory[:n_memory], n_idle
@@ -591,18 +588,19 @@ class NonsmoothEngine:
     def _pose(self, arrays: RockArrays, machine: MachineStep, status: IntArray) -> None:
         """Set positions, rotations and boxes: of awake rocks, of others that were moved, of the machine."""
         n, dt, margin = self.n_rocks, self.time_step, self.config.contact_margin
-        self._positions[:n] = arrays.positions
+        bodies = self._collision_bodies
+        bodies.positions[:n] = arrays.positions
         n_stale = broad_phase.find_stale(
             status, arrays.quaternions, arrays.positions, self._posed, self._stale
         )
         broad_phase.calc_poses(
-            self.shape, self.scale, arrays.quaternions, arrays.positions, arrays.velocities, dt, margin,
-            self.convex, self._stale[:n_stale], self._rotations, self._lower, self._upper,
+            bodies.shape, bodies.scale, arrays.quaternions, arrays.positions, arrays.velocities, dt, margin,
+            self.convex, self._stale[:n_stale], bodies.rotations, self._lower, self._upper,
             self.inverse_inertia_local, self._inverse_inertia,
         )  # fmt: skip
         broad_phase.calc_piece_boxes(
-            self.first_piece, self.piece_body, self.shape, self.convex, machine.X_WBs,
-            self._velocities[n + 1 :], dt, margin, self._positions, self._rotations, self._lower, self._upper,
+            self.first_piece, self.piece_body, bodies.shape, self.convex, machine.X_WBs,
+            self._velocities[n + 1 :], dt, margin, bodies.positions, bodies.rotations, self._lower, self._upper,
         )  # fmt: skip
 
     def _find_pairs(self, status: IntArray) -> int:
@@ -631,8 +629,8 @@ class NonsmoothEngine:
 
     def _sort_grid(self, rocks: IntArray, reach: float, low: Array, high: Array) -> Grid:
         """Sort the rocks of one class of size that are within reach of the box into a grid."""
-        inverse_width = 1.0 / (1.3 * reach)
-        n_near, first, last = broad_phase.find_near(rocks, self._positions, low, high, reach, self._near)
+        inverse_width, positions = 1.0 / (1.3 * reach), self._collision_bodies.positions
+        n_near, first, last = broad_phase.find_near(rocks, positions, low, high, reach, self._near)
         rocks = self._near[:n_near]
         origin = np.maximum(first, self._lower_site)
         extent = np.minimum(last, self._upper_site) - origin if n_near > 0 else np.zeros(3)
@@ -641,7 +639,7 @@ class NonsmoothEngine:
         items = np.empty(len(rocks), np.int64)
         boxes = np.empty((len(rocks), 6))
         broad_phase.sort_into_grid(
-            rocks, self._positions, self._lower, self._upper, origin, inverse_width, n_cells, cell_start,
+            rocks, positions, self._lower, self._upper, origin, inverse_width, n_cells, cell_start,
             np.empty_like(items), items, boxes,
         )  # fmt: skip
         return items, boxes, origin, inverse_width, n_cells, cell_start, reach
@@ -667,20 +665,22 @@ class NonsmoothEngine:
         config = self.config
         while True:
             n_rows = narrow_phase.follow_contacts(
-                memory, self._active, n_active, self._calm, self._positions, self._rotations,
-                self.solver_body, self.friction, self.restitution, self._rows, self._body_a, self._body_b,
-                self._row_key, self._row_rock,
-            )  # fmt: skip
+                memory,
+                self._active,
+                n_active,
+                self._calm,
+                self._collision_bodies,
+                self.restitution,
+                self._rows,
+            )
             n_rows = narrow_phase.find_contacts(
                 self._pair_a, self._pair_b, n_pairs, self.n_rocks, self.first_plane, self.first_piece,
-                self.planes, self.convex, self.shape, self.scale, self._positions, self._rotations,
-                self._velocities, self.solver_body, self.friction, self.restitution, self.time_step,
-                config.contact_margin, config.manifold_gap, config.face_cosine, config.manifold_points, self._calm,
-                config.slow_speed, memory, table,
-                self._axis_keys, self._axes, self._rows, self._body_a, self._body_b, self._row_key,
-                self._row_rock, n_rows, self._statistics, self._narrow_workspace,
+                self.planes, self.convex, self._collision_bodies, self._velocities, self.restitution,
+                self.time_step, config.contact_margin, config.manifold_gap, config.face_cosine,
+                config.manifold_points, self._calm, config.slow_speed, memory, table, self._axis_keys, self._axes,
+                self._rows, n_rows, self._statistics, self._narrow_workspace,
             )  # fmt: skip
-            if n_rows <= len(self._rows):
+            if n_rows <= len(self._rows.values):
                 return int(n_rows)
             self._allocate_rows(n_rows + n_rows // 4)
 

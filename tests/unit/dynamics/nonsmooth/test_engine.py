@@ -98,7 +98,7 @@ def test_frictionless_contacts_agree_with_a_quadratic_program():
     arrays = engine.make_arrays(pile)
     new, report = engine.step(arrays, make_machineless_step())
     assert report.n_loaded >= 4
-    rows = engine._rows[: report.n_contacts]
+    rows = engine._rows.values[: report.n_contacts]
     normals, gaps = rows[:, contacts.NORMAL : contacts.NORMAL + 3], rows[:, contacts.GAP]
     # v minimises 1/2 (v - v_free)^T M (v - v_free) with G v >= bias, translations and rotations
     program = MathematicalProgram()
@@ -120,7 +120,7 @@ def test_frictionless_contacts_agree_with_a_quadratic_program():
     program.AddQuadraticCost(mass, -mass @ free.reshape(-1), v, is_convex=True)
     for k in range(len(rows)):
         g = np.zeros(6 * n)
-        a, b = engine._body_a[k], engine._body_b[k]
+        a, b = engine._rows.body_a[k], engine._rows.body_b[k]
         g[6 * a : 6 * a + 6] = -np.concatenate([np.cross(rows[k, 9:12], normals[k]), normals[k]])
         if b < n:
             g[6 * b : 6 * b + 6] += np.concatenate([np.cross(rows[k, 12:15], normals[k]), normals[k]])
@@ -257,7 +257,7 @@ def test_contacts_of_slow_rocks_follow_their_motion():
     assert searched[1:] == [0, 0, 0]
     engine.config = NonsmoothConfig(reduction="none", search_period=1)
     _, report = engine.advance(arrays)
-    keys, rows = engine._row_key[: report.n_contacts], engine._rows[: report.n_contacts]
+    keys, rows = engine._rows.key[: report.n_contacts], engine._rows.values[: report.n_contacts]
     memory_keys = np.array([contacts.read_key(arrays.memory, row) for row in range(len(arrays.memory))])
     pairs = np.intersect1d(keys, memory_keys)
     assert len(pairs) > 60
@@ -320,10 +320,10 @@ def test_two_contexts_keep_their_solutions_apart():
 def test_memory_keeps_keys_and_simplices_whole():
     """Their columns are of single precision; the largest numbers have to come back."""
     memory = np.zeros((1, contacts.MEMORY_WIDTH), np.float32)
-    rows = np.zeros((1, contacts.ROW_WIDTH))
+    rows = contacts.make_contact_rows(1)
     corners = np.array([[127, 126], [125, 127], [127, 127]])
-    rows[0, contacts.IMPULSE], rows[0, contacts.SIMPLEX] = 1.0, gjk.encode_simplex(corners, 3)
-    key = (contacts.KEY_STEP - 2) * contacts.KEY_STEP + contacts.KEY_STEP - 1
+    rows.values[0, [contacts.IMPULSE, contacts.SIMPLEX]] = 1.0, gjk.encode_simplex(corners, 3)
+    rows.key[0] = key = (contacts.KEY_STEP - 2) * contacts.KEY_STEP + contacts.KEY_STEP - 1
     empty = np.zeros(0, np.int64)
     n, n_idle = contacts.write_memory(
         0,
@@ -333,8 +333,6 @@ def test_memory_keeps_keys_and_simplices_whole():
         0,
         rows,
         1,
-        np.array([key]),
-        np.zeros(1, np.int64),
         np.eye(3)[None],
         np.zeros((1, 6)),
         0.01,
@@ -504,9 +502,7 @@ def push_light_rocks(speed, **settings):
 def test_sweeps_around_the_machine_bring_its_momentum_through_light_rocks():
     left = {}
     for sweeps, iterations in ((0, 50), (3, 50), (0, 200), (0, 2000)):
-        engine, report = push_light_rocks(
-            0.3, machine_sweeps=sweeps, iterations=iterations, momentum=0.0
-        )
+        engine, report = push_light_rocks(0.3, machine_sweeps=sweeps, iterations=iterations, momentum=0.0)
         left[sweeps, iterations] = report.machine_velocity[0]
         # what the rocks got is what the machine lost, however many sweeps there were
         assert -report.F_Bs_W[0, 3] * engine.time_step == pytest.approx(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drakerock.dynamics.nonsmooth.collision.broad_phase import CALM, SEARCHED
 from drakerock.dynamics.nonsmooth.collision.geometry import (
@@ -51,6 +53,7 @@ from drakerock.dynamics.nonsmooth.contacts import (
     SIMPLEX,
     TANGENT_1,
     TANGENT_2,
+    ContactRows,
     find_axis,
     find_in_memory,
     is_loaded,
@@ -65,6 +68,25 @@ FAST = 0.03
 
 
 Workspace = tuple[GjkWorkspace, tuple[Array, Array, Array, Array], Array, Array]
+
+
+class CollisionBodies(NamedTuple):
+    """All bodies that touch: rocks, static pieces, planes, pieces of the machine (n bodies).
+
+    Attributes:
+        shape, scale: (n,) number and scale of each one's shape.
+        positions, rotations: (n, 3) [m], (n, 3, 3).
+        solver_body: (n,) body of the solve: rocks are their own, all that stands still is the one after the last rock,
+            machine bodies are beyond.
+        friction: (n,) each one's coefficient; a pair has 2 a b / (a + b).
+    """
+
+    shape: NDArray[np.int64]
+    scale: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+    solver_body: NDArray[np.int64]
+    friction: NDArray[np.float64]
 
 
 @allocating_kernel
@@ -157,33 +179,35 @@ def _add_fast_points(
 
 @kernel
 def _write_row(
-    rows: Array,
+    rows: ContactRows,
     n_rows: int,
-    n: tuple[float, float, float],
-    point: tuple[float, float, float],
-    positions: Array,
+    bodies: CollisionBodies,
     a: int,
     b: int,
+    n: tuple[float, float, float],
+    point: tuple[float, float, float],
     gap: float,
     impulse: tuple[float, float, float],
-    friction: Array,
     restitution: float,
     simplex: int,
 ) -> None:
-    """Set a contact row: normal, point from A's origin, gap, impulse in W, friction, restitution, simplex."""
+    """Set a contact row: bodies, normal, point from A's origin, gap, impulse in W, restitution, simplex."""
+    rows.body_a[n_rows], rows.body_b[n_rows] = bodies.solver_body[a], bodies.solver_body[b]
+    rows.key[n_rows], rows.rock[n_rows] = a * KEY_STEP + b, a
     nx, ny, nz = n
     x, y, z = point
     ix, iy, iz = impulse
     tx, ty, tz, ux, uy, uz = make_tangents(nx, ny, nz)
-    out = rows[n_rows]
+    out = rows.values[n_rows]
     out[NORMAL], out[NORMAL + 1], out[NORMAL + 2] = nx, ny, nz
     out[TANGENT_1], out[TANGENT_1 + 1], out[TANGENT_1 + 2] = tx, ty, tz
     out[TANGENT_2], out[TANGENT_2 + 1], out[TANGENT_2 + 2] = ux, uy, uz
     out[ARM_A], out[ARM_A + 1], out[ARM_A + 2] = x, y, z
-    out[ARM_B] = x + positions[a, 0] - positions[b, 0]
-    out[ARM_B + 1] = y + positions[a, 1] - positions[b, 1]
-    out[ARM_B + 2] = z + positions[a, 2] - positions[b, 2]
-    out[FRICTION] = 2.0 * friction[a] * friction[b] / (friction[a] + friction[b])
+    out[ARM_B] = x + bodies.positions[a, 0] - bodies.positions[b, 0]
+    out[ARM_B + 1] = y + bodies.positions[a, 1] - bodies.positions[b, 1]
+    out[ARM_B + 2] = z + bodies.positions[a, 2] - bodies.positions[b, 2]
+    mu_a, mu_b = bodies.friction[a], bodies.friction[b]
+    out[FRICTION] = 2.0 * mu_a * mu_b / (mu_a + mu_b)
     out[GAP] = gap
     out[SIMPLEX] = simplex
     out[RESTITUTION] = restitution
@@ -194,28 +218,16 @@ def _write_row(
 
 @kernel
 def _follow_row(
-    memory: Array,
-    row: int,
-    positions: Array,
-    rotations: Array,
-    solver_body: Array,
-    friction: Array,
-    restitution: Array,
-    rows: Array,
-    body_a: Array,
-    body_b: Array,
-    row_key: Array,
-    row_rock: Array,
-    n_rows: int,
+    memory: Array, row: int, bodies: CollisionBodies, restitution: Array, rows: ContactRows, n_rows: int
 ) -> int:
     """Set a contact row from the memory; return the number of rows.
 
     Point and normal are carried by the pair's first rock, the gap has followed the velocities: errors are of second
     order in the pair's own motion, fractions of a millimetre.
     """
-    if n_rows < len(rows):
+    if n_rows < len(rows.values):
         a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
-        r_a = get_rotation(rotations, a)
+        r_a = get_rotation(bodies.rotations, a)
         point = rotate(
             r_a, memory[row, MEMORY_POINT], memory[row, MEMORY_POINT + 1], memory[row, MEMORY_POINT + 2]
         )
@@ -228,12 +240,9 @@ def _follow_row(
             float(memory[row, MEMORY_IMPULSE + 2]),
         )
         _write_row(
-            rows, n_rows, normal, point, positions, a, b, float(memory[row, MEMORY_GAP]), impulse, friction,
-            restitution[0], read_simplex(memory, row),
+            rows, n_rows, bodies, a, b, normal, point, float(memory[row, MEMORY_GAP]), impulse, restitution[0],
+            read_simplex(memory, row),
         )  # fmt: skip
-        body_a[n_rows], body_b[n_rows] = solver_body[a], solver_body[b]
-        row_key[n_rows] = read_key(memory, row)
-        row_rock[n_rows] = a
     return n_rows + 1
 
 
@@ -243,24 +252,17 @@ def follow_contacts(
     active: Array,
     n_active: int,
     calm: Array,
-    positions: Array,
-    rotations: Array,
-    solver_body: Array,
-    friction: Array,
+    bodies: CollisionBodies,
     restitution: Array,
-    rows: Array,
-    body_a: Array,
-    body_b: Array,
-    row_key: Array,
-    row_rock: Array,
+    rows: ContactRows,
 ) -> int:
     """Set the rows of pairs of calm bodies from the memory: they follow the bodies' motion since the last search.
 
     Args:
         memory, active, n_active: loaded points of the last step and those about to touch, see `contacts`.
         calm: per body CALM, COMOVING or SEARCHED, see `broad_phase`.
-        positions, rotations, solver_body, friction, restitution: as for `find_contacts`.
-        rows, body_a, body_b, row_key, row_rock: set, see `contacts`.
+        bodies, restitution: as for `find_contacts`.
+        rows: set.
 
     Returns:
         number of rows; beyond the capacity they are counted but not stored.
@@ -269,10 +271,7 @@ def follow_contacts(
     for k in range(n_active):
         row = active[k]
         if calm[int(memory[row, MEMORY_FIRST])] == CALM and calm[int(memory[row, MEMORY_SECOND])] == CALM:
-            n_rows = _follow_row(
-                memory, row, positions, rotations, solver_body, friction, restitution, rows, body_a, body_b,
-                row_key, row_rock, n_rows,
-            )  # fmt: skip
+            n_rows = _follow_row(memory, row, bodies, restitution, rows, n_rows)
     return n_rows
 
 
@@ -302,13 +301,8 @@ def find_contacts(
     first_piece: int,
     planes: Array,
     shapes: ConvexShapes,
-    shape: Array,
-    scale: Array,
-    positions: Array,
-    rotations: Array,
+    bodies: CollisionBodies,
     velocities: Array,
-    solver_body: Array,
-    friction: Array,
     restitution: Array,
     time_step: float,
     margin: float,
@@ -321,29 +315,20 @@ def find_contacts(
     table: Array,
     axis_keys: Array,
     axes: Array,
-    rows: Array,
-    body_a: Array,
-    body_b: Array,
-    row_key: Array,
-    row_rock: Array,
+    rows: ContactRows,
     n_rows: int,
     statistics: Array,
     workspace: Workspace,
 ) -> int:
     """Find the contact points of all pairs.
 
-    Bodies are numbered rocks, static pieces, planes, pieces of the machine. `solver_body` maps them to the
-    bodies of the solve: rocks to themselves, all that stands still to `n_rocks`, machine bodies beyond.
-
     Args:
         pair_a, pair_b, n_pairs: pairs from the broad phase, first a rock.
         n_rocks, first_plane, first_piece: where statics, planes and machine pieces start (statics at n_rocks).
         planes: (p, 4).
-        shapes, shape, scale: all shapes; per body its shape and scale.
-        positions, rotations: per body [m].
+        shapes: all shapes.
+        bodies: rocks, static pieces, planes, pieces of the machine, in this order.
         velocities: (solver bodies, 6) angular, translational, at the last step.
-        solver_body: per body.
-        friction: per body, its own coefficient; a pair has 2 a b / (a + b).
         restitution: (2,) rock against rock or site, rock against machine.
         time_step: [s]; pairs that can meet within it get contacts beforehand.
         margin: contacts are found up to this gap [m].
@@ -354,7 +339,7 @@ def find_contacts(
         slow_speed: pairs of rocks that are not SEARCHED, slower than this against each other, follow [m/s].
         memory, table: loaded points of the last step, see `contacts`.
         axis_keys, axes: cache of separating axes: skips pairs, never changes a result.
-        rows, body_a, body_b, row_key, row_rock: set, see `contacts`.
+        rows: set from `n_rows` on.
         n_rows: number of rows before.
         statistics: (4,) set: pairs skipped, distances computed, overlapping cores, rows.
         workspace: from `make_workspace`.
@@ -363,6 +348,7 @@ def find_contacts(
         number of rows; beyond the capacity they are counted but not stored.
     """
     gjk_workspace, manifold_workspace, all_points, known_points = workspace
+    shape, scale, positions, rotations = bodies.shape, bodies.scale, bodies.positions, bodies.rotations
     points = all_points[:max_points]
     statistics[:] = 0
     for pair in range(n_pairs):
@@ -370,7 +356,7 @@ def find_contacts(
         key = a * KEY_STEP + b
         shape_a, scale_a = shape[a], scale[a]
         r_a = get_rotation(rotations, a)
-        body_1, body_2 = solver_body[a], solver_body[b]
+        body_1, body_2 = bodies.solver_body[a], bodies.solver_body[b]
         speed2 = 0.0
         for d in range(3, 6):
             speed2 += (velocities[body_1, d] - velocities[body_2, d]) ** 2
@@ -386,10 +372,7 @@ def find_contacts(
         ):
             row = remembered
             while row < len(memory) and read_key(memory, row) == key:
-                n_rows = _follow_row(
-                    memory, row, positions, rotations, solver_body, friction, restitution, rows, body_a, body_b,
-                    row_key, row_rock, n_rows,
-                )  # fmt: skip
+                n_rows = _follow_row(memory, row, bodies, restitution, rows, n_rows)
                 row += 1
             continue
         # The direction in which the pair pushed last starts the search; where it did is preferred.
@@ -495,7 +478,7 @@ def find_contacts(
         match_limit = 0.3 * scale_a * shapes.radius[shape_a]
         used = 0
         for k in range(n_points):
-            if n_rows >= len(rows):
+            if n_rows >= len(rows.values):
                 n_rows += 1
                 continue
             x, y, z = points[k, 0], points[k, 1], points[k, 2]
@@ -523,12 +506,9 @@ def find_contacts(
                         float(memory[found, MEMORY_IMPULSE + 2]),
                     )
             _write_row(
-                rows, n_rows, (nx, ny, nz), (x, y, z), positions, a, b, points[k, 3], (ix, iy, iz), friction,
+                rows, n_rows, bodies, a, b, (nx, ny, nz), (x, y, z), points[k, 3], (ix, iy, iz),
                 restitution[1] if body_2 > n_rocks else restitution[0], simplex,
             )  # fmt: skip
-            body_a[n_rows], body_b[n_rows] = body_1, body_2
-            row_key[n_rows] = key
-            row_rock[n_rows] = a
             n_rows += 1
     statistics[3] = n_rows
     return n_rows
