@@ -266,6 +266,24 @@ def test_contacts_of_slow_rocks_follow_their_motion():
     np.testing.assert_allclose(followed, found, atol=2e-5)
 
 
+@pytest.mark.parametrize(
+    ("speed", "searches"),
+    [(0.001, 1), (0.01, 11), (0.019, 20), (0.05, 17)],
+    ids=["slow: every millimetre", "ten times as fast", "every fifth step", "fast: every sixth step"],
+)
+def test_how_often_rocks_that_move_together_are_searched(speed, searches):
+    pile = make_pile([[0, 0, 2.0], [0.5005, 0, 2.0]], velocities=[[0, 0, 0, speed, 0, 0]] * 2)
+    engine = make_engine(
+        pile, [make_box(0.5, 0.5, 0.5)], config=NonsmoothConfig(reduction="none"), gravity=0.0
+    )
+    arrays, n_searches = engine.make_arrays(pile), 0
+    for _ in range(100):
+        arrays, report = engine.advance(arrays)
+        n_searches += engine._statistics[1] > 0
+        assert report.n_contacts == 4
+    assert n_searches == pytest.approx(searches, abs=1)
+
+
 def test_a_rock_that_strikes_is_searched_at_once():
     """Between two searches of the slow ones, a fast rock finds what it hits, and sinks in no deeper than ever."""
     depths = {}
