@@ -108,7 +108,7 @@ class StepReport:
         F_Bs_W: (b, 6) spatial impulse over time step of the rocks on each machine body at its origin, in W:
             torque [N m], force [N].
         machine_velocity: (v,) the machine's generalised velocities as the contact solve left them.
-        n_awake: rocks awake in the step.
+        awake: (m,) the rocks awake in the step, the only ones that moved.
         n_contacts: contact points; n_loaded of them carry load.
         n_sweeps: sweeps of the resting stage.
         residual: the last one's change of the normal impulses over their sum or the weight, see `solve_resting`.
@@ -121,7 +121,7 @@ class StepReport:
 
     F_Bs_W: Array
     machine_velocity: Array
-    n_awake: int
+    awake: IntArray
     n_contacts: int
     n_loaded: int
     n_sweeps: int
@@ -134,6 +134,11 @@ class StepReport:
     redone: bool
     flagged: bool
     overflow: int
+
+    @property
+    def n_awake(self) -> int:
+        """Number of rocks awake in the step."""
+        return len(self.awake)
 
 
 def make_machineless_step() -> MachineStep:
@@ -248,7 +253,7 @@ class NonsmoothEngine:
         self._lower = np.full((n_bodies, 3), np.inf)
         self._upper = np.full((n_bodies, 3), -np.inf)
         self._inverse_inertia = np.zeros((n, 6))
-        self._posed = np.full((n, 7), np.nan)
+        self._posed_quaternions = np.full((n, 4), np.nan)
         self._stale = np.zeros(n, np.int64)
         self._near = np.zeros(n, np.int64)
         self._bodies = np.zeros((n + 1, solver.BODY_WIDTH))
@@ -416,8 +421,9 @@ class NonsmoothEngine:
         Args:
             arrays: state at t_n; not changed.
             machine: the machine at t_n, see `MachineStep`.
-            room: where the result is written, see `make_room`; new if None. Allocating it anew in every step takes as
-                long as all passes over resting rocks.
+            room: where the result is written, see `make_room`; new if None. Rows of poses and velocities of rocks that
+                are not awake are left as they are in it: they are those before the step. To copy them in every step
+                would take as long as all passes over resting rocks.
 
         Returns:
             state at t_n + dt, and the report.
@@ -430,7 +436,10 @@ class NonsmoothEngine:
             if not motion.are_finite(getattr(arrays, name)):
                 raise SimulationFailure(f"rocks: {name} that are not finite")
         iterations, momentum = self.config.iterations, self.config.momentum
-        room = room or self.make_room()
+        if room is None:
+            room = self.make_room()
+            for name in ("positions", "quaternions", "velocities"):
+                getattr(room, name)[:] = getattr(arrays, name)
         new, report = self._try_step(arrays, machine, room, iterations, momentum, warm=True, search_all=False)
         if new is not None and report is not None and report.residual <= self.config.max_residual:
             return new, report
@@ -491,10 +500,16 @@ class NonsmoothEngine:
             -1.0 if search_all else config.search_distance, search_all or arrays.steps % config.search_period == 0,
             self._calm,
         )  # fmt: skip
-        self._velocities[:n] = arrays.velocities
         self._velocities[n + 1 :] = machine.arrays.jacobian @ machine.velocity
         self._pose(arrays, machine, status)
-        motion.set_bodies(awake, arrays.velocities, self.inverse_mass, self._inverse_inertia, self._bodies)
+        motion.set_bodies(
+            awake,
+            arrays.velocities,
+            self.inverse_mass,
+            self._inverse_inertia,
+            self._bodies,
+            self._velocities,
+        )
 
         n_pairs = self._find_pairs(status)
         places, n_active = contacts.index_memory(memory, n, status, self._active, self._table)
@@ -528,29 +543,24 @@ class NonsmoothEngine:
             float(self.mass[awake].sum()) * self.gravity * dt,
         )  # fmt: skip
 
-        new.quaternions[:] = arrays.quaternions
-        new.positions[:] = arrays.positions
-        new.velocities[:] = arrays.velocities
         sane = motion.move(
-            awake,
-            self._bodies,
-            self.inverse_inertia_local,
-            dt,
-            new.quaternions,
-            new.positions,
-            new.velocities,
-        )
+            awake, self._bodies, self.inverse_inertia_local, dt, arrays.quaternions, arrays.positions,
+            new.quaternions, new.positions, new.velocities,
+        )  # fmt: skip
         if not sane or not np.isfinite(velocity).all():
             # The rows of bodies that are not awake have to stay zero.
             self._bodies[:] = 0.0
             self._bodies_32[:] = 0.0
+            self._velocities[:] = 0.0
             return None, None
+        self._velocities[awake] = new.velocities[awake]
         n_memory, n_idle = contacts.write_memory(
             n, status, memory, self._active, n_active, self._rows, n_rows,
-            self._collision_bodies.rotations, new.velocities, dt,
+            self._collision_bodies.rotations, self._velocities, dt,
             2.0 * config.search_distance, new.memory,
         )  # fmt: skip
         new.memory, new.n_idle = new.memory[:n_memory], n_idle
+        self._velocities[awake] = 0.0
         if config.reduction == "rest":
             reduction.mark_by_movers(
                 book, new.velocities, new.memory, n_idle, config.rest.mover_speed, self._by_movers
@@ -569,7 +579,7 @@ class NonsmoothEngine:
             )
             / dt,
             machine_velocity=velocity,
-            n_awake=len(awake),
+            awake=awake,
             n_contacts=n_rows,
             n_loaded=int(loaded.sum()),
             n_sweeps=iterations,
@@ -589,9 +599,13 @@ class NonsmoothEngine:
         """Set positions, rotations and boxes: of awake rocks, of others that were moved, of the machine."""
         n, dt, margin = self.n_rocks, self.time_step, self.config.contact_margin
         bodies = self._collision_bodies
-        bodies.positions[:n] = arrays.positions
         n_stale = broad_phase.find_stale(
-            status, arrays.quaternions, arrays.positions, self._posed, self._stale
+            status,
+            arrays.quaternions,
+            arrays.positions,
+            self._posed_quaternions,
+            bodies.positions,
+            self._stale,
         )
         broad_phase.calc_poses(
             bodies.shape, bodies.scale, arrays.quaternions, arrays.positions, arrays.velocities, dt, margin,

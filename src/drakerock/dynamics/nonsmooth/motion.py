@@ -69,7 +69,12 @@ def _solve_symmetric(m: Array, i: int, x: float, y: float, z: float) -> Vector:
 
 @kernel
 def set_bodies(
-    awake: Array, velocities: Array, inverse_mass: Array, inverse_inertia: Array, bodies: Array
+    awake: Array,
+    velocities: Array,
+    inverse_mass: Array,
+    inverse_inertia: Array,
+    bodies: Array,
+    body_velocities: Array,
 ) -> None:
     """Set the bodies of the solve: awake rocks with their inertia, all others immovable and at rest.
 
@@ -79,11 +84,12 @@ def set_bodies(
         inverse_mass: (n,) [1/kg].
         inverse_inertia: (n, 6) in W's axes.
         bodies: (n + 1, BODY_WIDTH) set; zero before.
+        body_velocities: (n, 6) set; zero before.
     """
     for s in range(len(awake)):
         i = awake[s]
         for d in range(6):
-            bodies[i, d] = velocities[i, d]
+            bodies[i, d] = body_velocities[i, d] = velocities[i, d]
             bodies[i, INVERSE_INERTIA + d] = inverse_inertia[i, d]
         bodies[i, INVERSE_MASS] = inverse_mass[i]
 
@@ -104,9 +110,11 @@ def move(
     time_step: float,
     quaternions: Array,
     positions: Array,
-    velocities: Array,
+    new_quaternions: Array,
+    new_positions: Array,
+    new_velocities: Array,
 ) -> bool:
-    """Advance the awake rocks' poses with their new velocities.
+    """Set the awake rocks' poses after the step, and their velocities.
 
     Free spin keeps the angular momentum: the rotation is taken with the angular velocity at the middle of the
     step (explicit mid-point), and the new angular velocity follows from the momentum and the new inertia.
@@ -116,7 +124,8 @@ def move(
         bodies: (n + 1, BODY_WIDTH) after the solve; set to zero.
         inverse_inertia_local: (n, 6) in the rocks' frames.
         time_step: [s].
-        quaternions, positions, velocities: (n, 4), (n, 3), (n, 6) changed.
+        quaternions, positions: (n, 4), (n, 3) before the step.
+        new_quaternions, new_positions, new_velocities: (n, 4), (n, 3), (n, 6) set for the awake rocks.
 
     Returns:
         False if any of it is not finite.
@@ -128,8 +137,8 @@ def move(
         i = awake[s]
         wx, wy, wz = bodies[i, 0], bodies[i, 1], bodies[i, 2]
         for d in range(3):
-            positions[i, d] += time_step * bodies[i, 3 + d]
-            velocities[i, 3 + d] = bodies[i, 3 + d]
+            new_positions[i, d] = positions[i, d] + time_step * bodies[i, 3 + d]
+            new_velocities[i, 3 + d] = bodies[i, 3 + d]
         for d in range(6):
             local[0, d] = inverse_inertia_local[i, d]
             scratch[0, d] = bodies[i, INVERSE_INERTIA + d]
@@ -144,13 +153,14 @@ def move(
         wz = m[2] * lx + m[4] * ly + m[5] * lz
         qw, qx, qy, qz = turn(qw, qx, qy, qz, time_step * wx, time_step * wy, time_step * wz)
         rotate_inertia(_make_rotation(qw, qx, qy, qz), local, scratch, 0)
-        velocities[i, 0] = m[0] * lx + m[1] * ly + m[2] * lz
-        velocities[i, 1] = m[1] * lx + m[3] * ly + m[4] * lz
-        velocities[i, 2] = m[2] * lx + m[4] * ly + m[5] * lz
-        quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3] = qw, qx, qy, qz
+        new_velocities[i, 0] = m[0] * lx + m[1] * ly + m[2] * lz
+        new_velocities[i, 1] = m[1] * lx + m[3] * ly + m[4] * lz
+        new_velocities[i, 2] = m[2] * lx + m[4] * ly + m[5] * lz
+        new_quaternions[i, 0], new_quaternions[i, 1] = qw, qx
+        new_quaternions[i, 2], new_quaternions[i, 3] = qy, qz
         total = qw + qx + qy + qz
         for d in range(3):
-            total += positions[i, d] + velocities[i, d] + velocities[i, 3 + d]
+            total += new_positions[i, d] + new_velocities[i, d] + new_velocities[i, 3 + d]
         bodies[i] = 0.0
         # Not math.isfinite: with sums reordered it is compiled to True.
         if not abs(total) < HUGE:

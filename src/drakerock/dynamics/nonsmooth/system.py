@@ -192,7 +192,13 @@ class NonsmoothRocks(LeafSystem):
             "n_flagged": last[_N_FLAGGED] + report.flagged,
         }
         summary = [float(values[name]) for name in ROCK_SUMMARY]
-        self._write(discrete, _flatten(arrays, np.concatenate([summary, F_B_W])))
+        new = _flatten(arrays, np.concatenate([summary, F_B_W]))
+        # What is written to begins as a copy of the state before the step: only the awake have moved.
+        for name in ("quaternions", "positions", "velocities"):
+            before = discrete.get_mutable_value(self._groups[name]).reshape(self._engine.n_rocks, -1)
+            before[report.awake] = getattr(arrays, name)[report.awake]
+            del new[name]
+        self._write(discrete, new)
 
     def _calc_poses(self, context: Context, output: BasicVector) -> None:
         arrays = self._get_arrays(context)

@@ -252,13 +252,20 @@ def find_static_pairs(
 
 
 @kernel
-def find_stale(status: Array, quaternions: Array, positions: Array, posed: Array, stale: Array) -> int:
+def find_stale(
+    status: Array,
+    quaternions: Array,
+    positions: Array,
+    posed_quaternions: Array,
+    posed_positions: Array,
+    stale: Array,
+) -> int:
     """Find the rocks whose pose has to be set: the awake ones, and all that are not where they were last.
 
     Args:
         status: (n,) AWAKE, RESTING, FIXED or LOST.
         quaternions, positions: (n, 4), (n, 3) [m].
-        posed: (n, 7) poses of the last call; set.
+        posed_quaternions, posed_positions: (n, 4), (n, 3) at least, those of the last call; set.
         stale: (n,) set: indices.
 
     Returns:
@@ -268,12 +275,12 @@ def find_stale(status: Array, quaternions: Array, positions: Array, posed: Array
     for i in range(len(status)):
         moved = status[i] == AWAKE
         for d in range(4):
-            if posed[i, d] != quaternions[i, d]:
-                posed[i, d] = quaternions[i, d]
+            if posed_quaternions[i, d] != quaternions[i, d]:
+                posed_quaternions[i, d] = quaternions[i, d]
                 moved = True
         for d in range(3):
-            if posed[i, 4 + d] != positions[i, d]:
-                posed[i, 4 + d] = positions[i, d]
+            if posed_positions[i, d] != positions[i, d]:
+                posed_positions[i, d] = positions[i, d]
                 moved = True
         if moved:
             stale[n_stale] = i
