@@ -110,7 +110,6 @@ VARIANTS: dict[str, tuple[dict[str, object], float]] = {
         TIME_STEP,
     ),
     "no-machine-sweeps": ({"reduction": "none", "machine_sweeps": 0}, TIME_STEP),
-    "iterations-400": ({"reduction": "none", "iterations": 400}, TIME_STEP),
     "none-200": ({"reduction": "none", "iterations": 200}, TIME_STEP),
     "converged": ({"reduction": "none", "iterations": 400}, TIME_STEP),
 }

@@ -231,15 +231,14 @@ def main() -> None:
         push, speed, slow = [], [], []
         for one, true in zip(solved, exact, strict=True):
             push.append(abs(calc_push(one) - calc_push(true)))
-            change = (one.bodies - true.bodies)[one.awake, solver.LINEAR : solver.LINEAR + 3]
             mass = 1.0 / one.bodies[one.awake, solver.INVERSE_MASS]
-            velocities = [
+            found, right = (
                 problem.bodies[problem.awake, solver.LINEAR : solver.LINEAR + 3] for problem in (one, true)
-            ]
-            speeds, true_speeds = (np.linalg.norm(one, axis=1) for one in velocities)
+            )
+            speeds, true_speeds = np.linalg.norm(found, axis=1), np.linalg.norm(right, axis=1)
             chosen = true_speeds < SLOW
             slow.append(speeds[chosen].sum() / true_speeds[chosen].sum() - 1.0)
-            speed.append(1e3 * np.sqrt(mass @ (change**2).sum(axis=1) / mass.sum()))
+            speed.append(1e3 * np.sqrt(mass @ ((found - right) ** 2).sum(axis=1) / mass.sum()))
         cost = "" if cpu is None else f", {1e3 * cpu:.2f} ms"
         print(
             f"{name:50s} push off by {np.mean(push):5.1f} kN, 90th percentile {np.percentile(push, 90):5.1f}; "

@@ -60,20 +60,18 @@ class ContactRows(NamedTuple):
     Attributes:
         values: (n, ROW_WIDTH).
         body_a, body_b: (n,) the bodies of the solve that each row is between.
-        key: (n,) its pair's key, see `read_key`.
-        rock: (n,) its pair's first rock.
+        key: (n,) its pair's key, see `KEY_STEP`.
     """
 
     values: NDArray[np.float64]
     body_a: NDArray[np.int64]
     body_b: NDArray[np.int64]
     key: NDArray[np.int64]
-    rock: NDArray[np.int64]
 
 
 def make_contact_rows(capacity: int) -> ContactRows:
     """Return room for so many rows."""
-    numbers = [np.zeros(capacity, np.int64) for _ in range(4)]
+    numbers = [np.zeros(capacity, np.int64) for _ in range(3)]
     return ContactRows(np.zeros((capacity, ROW_WIDTH)), *numbers)
 
 
@@ -214,8 +212,8 @@ def write_memory(
         if normal <= 0.0 and (row[GAP] >= near_gap or n_new >= room_for_near):
             continue
         if n_new < len(new):
-            a, b = rows.rock[k], rows.key[k] % KEY_STEP
-            new[n_new, MEMORY_FIRST], new[n_new, MEMORY_SECOND] = rows.key[k] // KEY_STEP, b
+            a, b = rows.key[k] // KEY_STEP, rows.key[k] % KEY_STEP
+            new[n_new, MEMORY_FIRST], new[n_new, MEMORY_SECOND] = a, b
             approach = _calc_approach(velocities[a], row, ARM_A)
             if b < n_rocks:
                 approach -= _calc_approach(velocities[b], row, ARM_B)

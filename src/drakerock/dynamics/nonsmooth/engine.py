@@ -34,6 +34,8 @@ Grid = tuple[IntArray, Array, Array, float, IntArray, IntArray, float]
 _log = logging.getLogger(__name__)
 
 GRAVITY = 9.81
+# Of `RockArrays`, what changes of awake rocks only.
+MOTION = ("positions", "quaternions", "velocities")
 # How far outside the site's box a rock still counts as inside [m].
 SITE_MARGIN = 0.5
 # A step that failed is solved again with this many times the iterations and without momentum, from a cold start if need
@@ -258,6 +260,7 @@ class NonsmoothEngine:
         self._near = np.zeros(n, np.int64)
         self._bodies = np.zeros((n + 1, solver.BODY_WIDTH))
         self._bodies_32 = np.zeros((n + 1, solver.BODY_WIDTH), np.float32)
+        # Zero between steps, for the rocks.
         self._velocities = np.zeros((n + 1 + self.n_machine_bodies, 6))
         self._marks = np.zeros(n + 1 + self.n_machine_bodies, np.int64)
         self._active = np.zeros(self.capacity, np.int64)
@@ -273,7 +276,6 @@ class NonsmoothEngine:
         self._calm = np.full(n_bodies, broad_phase.SEARCHED, np.int8)
         self._calm[n : self.first_piece] = broad_phase.CALM
         self._seeks = np.zeros(n, np.bool_)
-        self._cell_start = np.zeros(2, np.int64)
         self._allocate_pairs(20 * n + 256)
         self._allocate_rows(6 * n + 256)
         for k in range(n, self.first_plane):
@@ -432,13 +434,13 @@ class NonsmoothEngine:
             SimulationFailure: the result is not finite or has not converged, also when solved again with
                 `RETRY_FACTOR` times the iterations and without momentum.
         """
-        for name in ("positions", "quaternions", "velocities"):
+        for name in MOTION:
             if not motion.are_finite(getattr(arrays, name)):
                 raise SimulationFailure(f"rocks: {name} that are not finite")
         iterations, momentum = self.config.iterations, self.config.momentum
         if room is None:
             room = self.make_room()
-            for name in ("positions", "quaternions", "velocities"):
+            for name in MOTION:
                 getattr(room, name)[:] = getattr(arrays, name)
         new, report = self._try_step(arrays, machine, room, iterations, momentum, warm=True, search_all=False)
         if new is not None and report is not None and report.residual <= self.config.max_residual:

@@ -29,6 +29,7 @@ from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.nonsmooth import contacts, reduction
 from drakerock.dynamics.nonsmooth.coupling import MachineLayout, MachineView, make_machine_layout
 from drakerock.dynamics.nonsmooth.engine import (
+    MOTION,
     NonsmoothEngine,
     RockArrays,
     StepReport,
@@ -194,7 +195,7 @@ class NonsmoothRocks(LeafSystem):
         summary = [float(values[name]) for name in ROCK_SUMMARY]
         new = _flatten(arrays, np.concatenate([summary, F_B_W]))
         # What is written to begins as a copy of the state before the step: only the awake have moved.
-        for name in ("quaternions", "positions", "velocities"):
+        for name in MOTION:
             before = discrete.get_mutable_value(self._groups[name]).reshape(self._engine.n_rocks, -1)
             before[report.awake] = getattr(arrays, name)[report.awake]
             del new[name]

@@ -350,7 +350,10 @@ def test_memory_keeps_keys_and_simplices_whole():
     rows = contacts.make_contact_rows(1)
     corners = np.array([[127, 126], [125, 127], [127, 127]])
     rows.values[0, [contacts.IMPULSE, contacts.SIMPLEX]] = 1.0, gjk.encode_simplex(corners, 3)
-    rows.key[0] = key = (contacts.KEY_STEP - 2) * contacts.KEY_STEP + contacts.KEY_STEP - 1
+    rock = contacts.KEY_STEP - 2
+    rows.key[0] = key = rock * contacts.KEY_STEP + contacts.KEY_STEP - 1
+    rotations = np.zeros((contacts.KEY_STEP, 3, 3))
+    rotations[rock] = np.eye(3)
     empty = np.zeros(0, np.int64)
     n, n_idle = contacts.write_memory(
         0,
@@ -360,8 +363,8 @@ def test_memory_keeps_keys_and_simplices_whole():
         0,
         rows,
         1,
-        np.eye(3)[None],
-        np.zeros((1, 6)),
+        rotations,
+        np.zeros((contacts.KEY_STEP, 6)),
         0.01,
         0.0,
         memory,

@@ -193,7 +193,7 @@ def _write_row(
 ) -> None:
     """Set a contact row: bodies, normal, point from A's origin, gap, impulse in W, restitution, simplex."""
     rows.body_a[n_rows], rows.body_b[n_rows] = bodies.solver_body[a], bodies.solver_body[b]
-    rows.key[n_rows], rows.rock[n_rows] = a * KEY_STEP + b, a
+    rows.key[n_rows] = a * KEY_STEP + b
     nx, ny, nz = n
     x, y, z = point
     ix, iy, iz = impulse
