@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drakerock.dynamics.nonsmooth.compiling import Array, kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, Vector, kernel
 
 # Columns of a contact row. All vectors in W; impulses act on body B, and reversed on body A.
 NORMAL = 0  # 0..2 unit normal from A to B
@@ -36,20 +36,18 @@ TANGENT_STEP = 29  # 2 / trace of the tangential block
 SIMPLEX = 30  # where the search for the nearest points ended, see `gjk.encode_simplex`; or 0
 ROW_WIDTH = 32
 
-# Columns of the memory, in single precision: all of it is copied in every step, also of rocks that rest.
-MEMORY_FIRST = 0  # the pair's bodies
-MEMORY_SECOND = 1
-MEMORY_POINT = 2  # 2..4
-MEMORY_IMPULSE = 5  # 5..7
-MEMORY_SIMPLEX = 8  # 8..9, its lower and its upper bits
-MEMORY_NORMAL = 10  # 10..12 in the frame of the pair's first rock
-MEMORY_GAP = 13
-MEMORY_WIDTH = 14  # even: two numbers take the room of one of the context's
+# Columns of the memory's values, in single precision: all of it is copied in every step, also of rocks that rest.
+MEMORY_POINT = 0  # 0..2
+MEMORY_IMPULSE = 3  # 3..5
+MEMORY_SIMPLEX = 6  # 6..7, its lower and its upper bits
+MEMORY_NORMAL = 8  # 8..10 in the frame of the pair's first rock
+MEMORY_GAP = 11
+MEMORY_WIDTH = 12  # even: two numbers take the room of one of the context's
 
 # Points without load go into memory up to this share of its capacity, so that those with load find room.
 NEAR_SHARE = 0.875
 
-# A pair's key is first * KEY_STEP + second; bodies are below it, so they are exact in single precision.
+# A pair's key is first * KEY_STEP + second; bodies are below it.
 KEY_STEP = 1 << 20
 SIMPLEX_STEP = 1 << 22
 
@@ -69,6 +67,27 @@ class ContactRows(NamedTuple):
     key: NDArray[np.int64]
 
 
+class Memory(NamedTuple):
+    """The memory of m contact points. Pairs are apart from the rest: they are looked at in passes over all points.
+
+    Attributes:
+        pairs: (m, 2) int32 the bodies of each; first a rock.
+        values: (m, MEMORY_WIDTH) float32.
+    """
+
+    pairs: NDArray[np.int32]
+    values: NDArray[np.float32]
+
+    def select(self, rows: slice | NDArray[np.bool_]) -> Memory:
+        """Return some of the points, as numpy indexes them."""
+        return Memory(self.pairs[rows], self.values[rows])
+
+
+def make_memory(n: int) -> Memory:
+    """Return memory of so many points, all zero."""
+    return Memory(np.zeros((n, 2), np.int32), np.zeros((n, MEMORY_WIDTH), np.float32))
+
+
 def make_contact_rows(capacity: int) -> ContactRows:
     """Return room for so many rows."""
     numbers = [np.zeros(capacity, np.int64) for _ in range(3)]
@@ -81,30 +100,43 @@ def _hash(key: int, mask: int) -> int:
 
 
 @kernel
-def read_key(memory: Array, row: int) -> int:
+def read_key(memory: Memory, row: int) -> int:
     """Return the key of the pair that a row of the memory belongs to."""
-    return int(memory[row, MEMORY_FIRST]) * KEY_STEP + int(memory[row, MEMORY_SECOND])
+    return int(memory.pairs[row, 0]) * KEY_STEP + int(memory.pairs[row, 1])
 
 
 @kernel
-def read_simplex(memory: Array, row: int) -> int:
+def read_simplex(memory: Memory, row: int) -> int:
     """Return where the search of the row's pair ended, see `gjk.encode_simplex`."""
-    return int(memory[row, MEMORY_SIMPLEX]) + SIMPLEX_STEP * int(memory[row, MEMORY_SIMPLEX + 1])
+    return int(memory.values[row, MEMORY_SIMPLEX]) + SIMPLEX_STEP * int(
+        memory.values[row, MEMORY_SIMPLEX + 1]
+    )
 
 
 @kernel
-def is_loaded(memory: Array, row: int) -> bool:
+def read_impulse(memory: Memory, row: int) -> Vector:
+    """Return the impulse of a row of the memory, in W [N s]."""
+    values = memory.values
+    return (
+        float(values[row, MEMORY_IMPULSE]),
+        float(values[row, MEMORY_IMPULSE + 1]),
+        float(values[row, MEMORY_IMPULSE + 2]),
+    )
+
+
+@kernel
+def is_loaded(memory: Memory, row: int) -> bool:
     """Return whether a row of the memory carried load; the others are about to touch."""
-    x, y, z = memory[row, MEMORY_IMPULSE], memory[row, MEMORY_IMPULSE + 1], memory[row, MEMORY_IMPULSE + 2]
+    x, y, z = read_impulse(memory, row)
     return bool(x != 0.0 or y != 0.0 or z != 0.0)
 
 
 @kernel
-def index_memory(memory: Array, n_rocks: int, status: Array, active: Array, table: Array) -> tuple[int, int]:
+def index_memory(memory: Memory, n_rocks: int, status: Array, active: Array, table: Array) -> tuple[int, int]:
     """Set a hash table from a pair's key to the first of its rows in memory (rows of a pair are in line).
 
     Args:
-        memory: (m, MEMORY_WIDTH).
+        memory: of the last step (m points).
         n_rocks: number of rocks.
         status: (n,) of each rock, see `broad_phase`. A pair without an awake rock is idle: it is not searched, its
             points stay as they are, and it is left out.
@@ -116,8 +148,8 @@ def index_memory(memory: Array, n_rocks: int, status: Array, active: Array, tabl
         how many places are in use: a power of two; look up in ``table[:places]``. And the number of active rows.
     """
     n_active = 0
-    for row in range(len(memory)):
-        a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
+    for row in range(len(memory.pairs)):
+        a, b = memory.pairs[row, 0], memory.pairs[row, 1]
         if status[a] == 0 or (b < n_rocks and status[b] == 0):
             active[n_active] = row
             n_active += 1
@@ -140,7 +172,7 @@ def index_memory(memory: Array, n_rocks: int, status: Array, active: Array, tabl
 
 
 @kernel
-def find_in_memory(key: int, memory: Array, table: Array) -> int:
+def find_in_memory(key: int, memory: Memory, table: Array) -> int:
     """Return the first row of a pair in memory, or -1."""
     mask = len(table) - 1
     place = _hash(key, mask)
@@ -162,7 +194,7 @@ def find_axis(key: int, axis_keys: Array) -> tuple[int, bool]:
 def write_memory(
     n_rocks: int,
     status: Array,
-    old: Array,
+    old: Memory,
     active: Array,
     n_active: int,
     rows: ContactRows,
@@ -171,7 +203,7 @@ def write_memory(
     velocities: Array,
     time_step: float,
     near_gap: float,
-    new: Array,
+    new: Memory,
 ) -> tuple[int, int]:
     """Write the memory of the coming step: the points just solved, and all loaded points between rocks at rest.
 
@@ -185,7 +217,7 @@ def write_memory(
         velocities: (n, 6) of the rocks over the step [rad/s, m/s].
         time_step: [s].
         near_gap: points without load are kept up to this gap [m], while there is room.
-        new: (capacity, MEMORY_WIDTH) set, as many rows as there are points.
+        new: set, as many rows as there are points.
 
     Returns:
         the number of points; beyond the capacity they are counted but lost. And how many of them, the first, are of
@@ -193,50 +225,53 @@ def write_memory(
     """
     n_new = 0
     next_active = 0
-    for row in range(len(old)):
+    capacity = len(new.pairs)
+    for row in range(len(old.pairs)):
         if next_active < n_active and active[next_active] == row:
             next_active += 1
             continue
-        a, b = int(old[row, MEMORY_FIRST]), int(old[row, MEMORY_SECOND])
+        a, b = old.pairs[row, 0], old.pairs[row, 1]
         if status[a] == 3 or (b < n_rocks and status[b] == 3) or not is_loaded(old, row):
             continue
-        if n_new < len(new):
+        if n_new < capacity:
+            new.pairs[n_new, 0], new.pairs[n_new, 1] = a, b
             for d in range(MEMORY_WIDTH):
-                new[n_new, d] = old[row, d]
+                new.values[n_new, d] = old.values[row, d]
         n_new += 1
     n_idle = n_new
-    room_for_near = NEAR_SHARE * len(new)
+    room_for_near = NEAR_SHARE * capacity
     for k in range(n_rows):
         row = rows.values[k]
         normal, tangent_1, tangent_2 = row[IMPULSE], row[IMPULSE + 1], row[IMPULSE + 2]
         if normal <= 0.0 and (row[GAP] >= near_gap or n_new >= room_for_near):
             continue
-        if n_new < len(new):
+        if n_new < capacity:
+            values = new.values[n_new]
             a, b = rows.key[k] // KEY_STEP, rows.key[k] % KEY_STEP
-            new[n_new, MEMORY_FIRST], new[n_new, MEMORY_SECOND] = a, b
+            new.pairs[n_new, 0], new.pairs[n_new, 1] = a, b
             approach = _calc_approach(velocities[a], row, ARM_A)
             if b < n_rocks:
                 approach -= _calc_approach(velocities[b], row, ARM_B)
-            new[n_new, MEMORY_GAP] = row[GAP] - time_step * approach
+            values[MEMORY_GAP] = row[GAP] - time_step * approach
             simplex = int(row[SIMPLEX])
-            new[n_new, MEMORY_SIMPLEX] = simplex % SIMPLEX_STEP
-            new[n_new, MEMORY_SIMPLEX + 1] = simplex // SIMPLEX_STEP
+            values[MEMORY_SIMPLEX] = simplex % SIMPLEX_STEP
+            values[MEMORY_SIMPLEX + 1] = simplex // SIMPLEX_STEP
             for d in range(3):
-                new[n_new, MEMORY_NORMAL + d] = (
+                values[MEMORY_NORMAL + d] = (
                     rotations[a, 0, d] * row[NORMAL]
                     + rotations[a, 1, d] * row[NORMAL + 1]
                     + rotations[a, 2, d] * row[NORMAL + 2]
                 )
-                new[n_new, MEMORY_POINT + d] = (
+                values[MEMORY_POINT + d] = (
                     rotations[a, 0, d] * row[ARM_A]
                     + rotations[a, 1, d] * row[ARM_A + 1]
                     + rotations[a, 2, d] * row[ARM_A + 2]
                 )
-                new[n_new, MEMORY_IMPULSE + d] = (
+                values[MEMORY_IMPULSE + d] = (
                     normal * row[NORMAL + d] + tangent_1 * row[TANGENT_1 + d] + tangent_2 * row[TANGENT_2 + d]
                 )
         n_new += 1
-    return n_new, min(n_idle, len(new))
+    return n_new, min(n_idle, capacity)
 
 
 @kernel
@@ -251,28 +286,28 @@ def _calc_approach(velocity: Array, row: Array, arm: int) -> float:
 
 
 @kernel
-def sum_impulses(memory: Array, n_rocks: int, sums: Array) -> None:
+def sum_impulses(memory: Memory, n_rocks: int, sums: Array) -> None:
     """Set `sums` (n, 3) to the sum of the contact impulses on each rock [N s]."""
     sums[:] = 0.0
-    for row in range(len(memory)):
-        a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
+    for row in range(len(memory.pairs)):
+        a, b = memory.pairs[row, 0], memory.pairs[row, 1]
         for d in range(3):
-            sums[a, d] -= memory[row, MEMORY_IMPULSE + d]
+            sums[a, d] -= memory.values[row, MEMORY_IMPULSE + d]
         if b < n_rocks:
             for d in range(3):
-                sums[b, d] += memory[row, MEMORY_IMPULSE + d]
+                sums[b, d] += memory.values[row, MEMORY_IMPULSE + d]
 
 
 @kernel
-def sum_pressures(memory: Array, n_rocks: int, chosen: Array, pressures: Array) -> None:
+def sum_pressures(memory: Memory, n_rocks: int, chosen: Array, pressures: Array) -> None:
     """Set `pressures` (n,) of the rocks `chosen` (n,) to half the sum of the sizes of their contact impulses [N s]."""
     pressures[:] = 0.0
-    for row in range(len(memory)):
-        a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
+    for row in range(len(memory.pairs)):
+        a, b = memory.pairs[row, 0], memory.pairs[row, 1]
         if chosen[a] or (b < n_rocks and chosen[b]):
             size2 = 0.0
             for d in range(3):
-                size2 += memory[row, MEMORY_IMPULSE + d] ** 2
+                size2 += memory.values[row, MEMORY_IMPULSE + d] ** 2
             half = 0.5 * math.sqrt(size2)
             pressures[a] += half
             if b < n_rocks:

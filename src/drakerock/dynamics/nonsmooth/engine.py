@@ -88,7 +88,7 @@ class RockArrays:
         positions: (n, 3) [m].
         velocities: (n, 6) angular, translational in W.
         book: (n, reduction.BOOK_WIDTH) status and bookkeeping of the reduction.
-        memory: (m, contacts.MEMORY_WIDTH) float32, loaded contact points; m changes from step to step.
+        memory: of m contact points, loaded or about to touch; m changes from step to step.
         n_idle: so many of them, the first, are of rocks that were at rest in the last step.
         steps: how many have been taken.
     """
@@ -97,7 +97,7 @@ class RockArrays:
     positions: Array
     velocities: Array
     book: Array
-    memory: NDArray[np.float32]
+    memory: contacts.Memory
     n_idle: int = 0
     steps: int = 0
 
@@ -315,7 +315,7 @@ class NonsmoothEngine:
         book[:, reduction.ANCHOR : reduction.ANCHOR + 3] = pile.p_WRs
         # A pile's contacts don't tell normals and gaps.
         book[:, reduction.WAY] = np.inf
-        memory = np.zeros((0, contacts.MEMORY_WIDTH), np.float32)
+        memory = contacts.make_memory(0)
         if pile.contacts is not None:
             memory = self._make_memory(pile.contacts)
             if self.config.reduction == "rest":
@@ -340,8 +340,7 @@ class NonsmoothEngine:
 
     def make_pile(self, arrays: RockArrays, provenance: dict[str, object] | None = None) -> PileState:
         """Return the pile of state arrays, contact memory included."""
-        rows = arrays.memory
-        pairs = rows[:, [contacts.MEMORY_FIRST, contacts.MEMORY_SECOND]].astype(np.int64)
+        pairs, rows = arrays.memory.pairs.astype(np.int64), arrays.memory.values
         # The machine's are not the pile's, and what carries no load is found again.
         loaded = rows[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3].any(axis=1)
         kept = loaded & (pairs[:, 1] < self.first_piece)
@@ -366,14 +365,13 @@ class NonsmoothEngine:
             memory,
         )
 
-    def _make_memory(self, stored: ContactMemory) -> NDArray[np.float32]:
+    def _make_memory(self, stored: ContactMemory) -> contacts.Memory:
         second = np.where(stored.pairs[:, 1] < 0, self.n_rocks - 1 - stored.pairs[:, 1], stored.pairs[:, 1])
         known = np.flatnonzero(second < self.first_piece)[: self.capacity]
-        memory = np.zeros((len(known), contacts.MEMORY_WIDTH), np.float32)
-        memory[:, contacts.MEMORY_FIRST] = stored.pairs[known, 0]
-        memory[:, contacts.MEMORY_SECOND] = second[known]
-        memory[:, contacts.MEMORY_POINT : contacts.MEMORY_POINT + 3] = stored.points[known]
-        memory[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3] = stored.impulses[known]
+        memory = contacts.make_memory(len(known))
+        memory.pairs[:, 0], memory.pairs[:, 1] = stored.pairs[known, 0], second[known]
+        memory.values[:, contacts.MEMORY_POINT : contacts.MEMORY_POINT + 3] = stored.points[known]
+        memory.values[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3] = stored.impulses[known]
         return memory
 
     def _find_lost(self, positions: Array) -> NDArray[np.bool_]:
@@ -382,14 +380,13 @@ class NonsmoothEngine:
 
     def place(self, arrays: RockArrays, rocks: IntArray, p_WRs: Array, V_WRs: Array) -> RockArrays:
         """Return the state with rocks put at positions (m, 3) with velocities (m, 6), awake, contacts forgotten."""
-        pairs = arrays.memory[:, [contacts.MEMORY_FIRST, contacts.MEMORY_SECOND]]
-        kept = ~np.isin(pairs, rocks).any(axis=1)
+        kept = ~np.isin(arrays.memory.pairs, rocks).any(axis=1)
         new = replace(
             arrays,
             positions=arrays.positions.copy(),
             velocities=arrays.velocities.copy(),
             book=arrays.book.copy(),
-            memory=arrays.memory[kept],
+            memory=arrays.memory.select(kept),
             n_idle=int(kept[: arrays.n_idle].sum()),
         )
         new.positions[rocks] = p_WRs
@@ -412,7 +409,7 @@ class NonsmoothEngine:
             np.empty((n, 3)),
             np.empty((n, 6)),
             np.empty((n, reduction.BOOK_WIDTH)),
-            np.empty((self.capacity, contacts.MEMORY_WIDTH), np.float32),
+            contacts.make_memory(self.capacity),
         )
 
     def step(
@@ -561,7 +558,7 @@ class NonsmoothEngine:
             self._collision_bodies.rotations, self._velocities, dt,
             2.0 * config.search_distance, new.memory,
         )  # fmt: skip
-        new.memory, new.n_idle = new.memory[:n_memory], n_idle
+        new.memory, new.n_idle = new.memory.select(slice(n_memory)), n_idle
         self._velocities[awake] = 0.0
         if config.reduction == "rest":
             reduction.mark_by_movers(
@@ -593,7 +590,7 @@ class NonsmoothEngine:
             n_lost=n_lost,
             redone=False,
             flagged=max_penetration > config.max_penetration,
-            overflow=n_memory - len(new.memory),
+            overflow=n_memory - len(new.memory.pairs),
         )
         return new, report
 
@@ -675,9 +672,7 @@ class NonsmoothEngine:
             )
         )  # fmt: skip
 
-    def _find_contacts(
-        self, n_pairs: int, memory: NDArray[np.float32], table: IntArray, n_active: int
-    ) -> int:
+    def _find_contacts(self, n_pairs: int, memory: contacts.Memory, table: IntArray, n_active: int) -> int:
         config = self.config
         while True:
             n_rows = narrow_phase.follow_contacts(

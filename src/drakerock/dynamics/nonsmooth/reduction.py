@@ -18,13 +18,7 @@ import numpy as np
 
 from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, CALM, COMOVING, LOST, RESTING, SEARCHED
 from drakerock.dynamics.nonsmooth.compiling import Array, allocating_kernel, kernel
-from drakerock.dynamics.nonsmooth.contacts import (
-    MEMORY_FIRST,
-    MEMORY_IMPULSE,
-    MEMORY_SECOND,
-    is_loaded,
-    sum_pressures,
-)
+from drakerock.dynamics.nonsmooth.contacts import MEMORY_IMPULSE, Memory, is_loaded, sum_pressures
 
 # Columns of a rock's bookkeeping (all stored in the context).
 STATUS = 0
@@ -62,7 +56,7 @@ def is_sensed(x: float, y: float, z: float, radius: float, sensors: Array) -> bo
 
 @kernel
 def mark_by_movers(
-    book: Array, velocities: Array, memory: Array, n_idle: int, mover_speed: float, marks: Array
+    book: Array, velocities: Array, memory: Memory, n_idle: int, mover_speed: float, marks: Array
 ) -> None:
     """Mark the rocks that share a loaded contact with a mover.
 
@@ -75,8 +69,8 @@ def mark_by_movers(
     """
     n = len(book)
     marks[:] = False
-    for row in range(n_idle, len(memory)):
-        a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
+    for row in range(n_idle, len(memory.pairs)):
+        a, b = memory.pairs[row, 0], memory.pairs[row, 1]
         if b < n and is_loaded(memory, row):
             if _moves(book, velocities, a, mover_speed):
                 marks[b] = True
@@ -146,7 +140,7 @@ def wake(
     positions: Array,
     radius: Array,
     mass: Array,
-    memory: Array,
+    memory: Memory,
     n_idle: int,
     sensors: Array,
     by_movers: Array,
@@ -214,7 +208,7 @@ def wake(
 
 
 @kernel
-def _sum_where_touched(book: Array, memory: Array, n_idle: int, touched: Array, sums: Array) -> None:
+def _sum_where_touched(book: Array, memory: Memory, n_idle: int, touched: Array, sums: Array) -> None:
     """Sum the contact impulses of the rocks that were solved, or touched one that was; others' have not changed.
 
     Args:
@@ -223,22 +217,23 @@ def _sum_where_touched(book: Array, memory: Array, n_idle: int, touched: Array, 
         sums: (n, 3) zero before; added to for the rocks that are touched [N s].
     """
     n = len(book)
-    for row in range(n_idle, len(memory)):
-        touched[int(memory[row, MEMORY_FIRST])] = True
-        if memory[row, MEMORY_SECOND] < n:
-            touched[int(memory[row, MEMORY_SECOND])] = True
-    for row in range(len(memory)):
-        a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
+    for row in range(n_idle, len(memory.pairs)):
+        a, b = memory.pairs[row, 0], memory.pairs[row, 1]
+        touched[a] = True
+        if b < n:
+            touched[b] = True
+    for row in range(len(memory.pairs)):
+        a, b = memory.pairs[row, 0], memory.pairs[row, 1]
         if not touched[a] and (b >= n or not touched[b]):
             continue
         # What has left the site carries no more.
         if book[a, STATUS] == LOST or (b < n and book[b, STATUS] == LOST):
             continue
         for d in range(3):
-            sums[a, d] -= memory[row, MEMORY_IMPULSE + d]
+            sums[a, d] -= memory.values[row, MEMORY_IMPULSE + d]
         if b < n:
             for d in range(3):
-                sums[b, d] += memory[row, MEMORY_IMPULSE + d]
+                sums[b, d] += memory.values[row, MEMORY_IMPULSE + d]
 
 
 @kernel

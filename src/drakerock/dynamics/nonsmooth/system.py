@@ -98,8 +98,8 @@ class NonsmoothRocks(LeafSystem):
         arrays = engine.make_arrays(pile)
         values = _flatten(arrays)
         # Room for more points than there are: `counts` tells how many rows of the memory count, and the like.
-        room = engine.capacity * contacts.MEMORY_WIDTH // 2 - len(values["memory"])
-        values["memory"] = np.pad(values["memory"], (0, room))
+        for name, flat in _flatten_memory(contacts.make_memory(engine.capacity)).items():
+            values[name] = np.pad(values[name], (0, len(flat) - len(values[name])))
         self._groups = {name: self.DeclareDiscreteState(flat) for name, flat in values.items()}
         self._machine = self.DeclareAbstractInputPort("machine_step", Value[object](make_machineless_step()))
         step = self.DeclareCacheEntry(
@@ -156,7 +156,10 @@ class NonsmoothRocks(LeafSystem):
             state["positions"].reshape(n, 3),
             state["velocities"].reshape(n, 6),
             state["book"].reshape(n, reduction.BOOK_WIDTH),
-            state["memory"].view(np.float32).reshape(-1, contacts.MEMORY_WIDTH)[: int(state["counts"][0])],
+            contacts.Memory(
+                state["pairs"].view(np.int32).reshape(-1, 2),
+                state["memory"].view(np.float32).reshape(-1, contacts.MEMORY_WIDTH),
+            ).select(slice(int(state["counts"][0]))),
             int(state["counts"][1]),
             int(state["counts"][2]),
         )
@@ -240,9 +243,17 @@ def _flatten(arrays: RockArrays, report: Array | None = None) -> dict[str, Array
         "positions": arrays.positions.reshape(-1),
         "velocities": arrays.velocities.reshape(-1),
         "book": arrays.book.reshape(-1),
-        "memory": arrays.memory.reshape(-1).view(np.float64),  # bits, two numbers in one
-        "counts": np.array([len(arrays.memory), arrays.n_idle, arrays.steps], float),
+        **_flatten_memory(arrays.memory),
+        "counts": np.array([len(arrays.memory.pairs), arrays.n_idle, arrays.steps], float),
         "report": np.zeros(len(ROCK_SUMMARY) + 6) if report is None else report,
+    }
+
+
+def _flatten_memory(memory: contacts.Memory) -> dict[str, Array]:
+    # Bits, two numbers in one.
+    return {
+        "pairs": memory.pairs.reshape(-1).view(np.float64),
+        "memory": memory.values.reshape(-1).view(np.float64),
     }
 
 

@@ -138,11 +138,11 @@ def test_contact_memory_is_found_again():
         pile, [make_box(0.8, 0.6, 0.5)], config=NonsmoothConfig(reduction="none", momentum=0.0)
     )
     arrays, _ = run(engine, engine.make_arrays(pile), 0.5)
-    assert len(arrays.memory) == 4
+    assert len(arrays.memory.pairs) == 4
     sums, pressures = np.zeros((1, 3)), np.zeros(1)
     contacts.sum_impulses(arrays.memory, 1, sums)
     np.testing.assert_allclose(sums[0], [0, 0, engine.mass[0] * 9.81 * 0.01], rtol=1e-6, atol=1e-6)
-    impulses = arrays.memory[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3]
+    impulses = arrays.memory.values[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3]
     contacts.sum_pressures(arrays.memory, 1, np.ones(1, bool), pressures)
     assert pressures[0] == pytest.approx(0.5 * np.linalg.norm(impulses, axis=1).sum(), rel=1e-5)
     table = np.zeros(128, np.int64)
@@ -179,15 +179,17 @@ def test_a_stored_pile_starts_warm(tmp_path):
     again = engine.make_arrays(loaded)
     for name in ("positions", "quaternions", "velocities"):
         assert np.array_equal(getattr(arrays, name), getattr(again, name))
-    loaded_rows = arrays.memory[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3].any(axis=1)
-    assert len(again.memory) == loaded_rows.sum()
+    loaded_rows = arrays.memory.values[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3].any(axis=1)
+    assert len(again.memory.pairs) == loaded_rows.sum()
     # A pile keeps contact points and impulses in single precision, in memory as in the file: what was stored goes on
     # like what was not, bit for bit.
     kept = engine.make_arrays(pile)
-    assert np.array_equal(again.memory, kept.memory)
+    for one, other in zip(again.memory, kept.memory, strict=True):
+        assert np.array_equal(one, other)
     # Where searches ended is not stored.
-    columns = slice(contacts.MEMORY_SIMPLEX)
-    assert np.allclose(again.memory[:, columns], arrays.memory[loaded_rows][:, columns], rtol=1e-6, atol=1e-6)
+    stored, columns = arrays.memory.select(loaded_rows), slice(contacts.MEMORY_SIMPLEX)
+    assert np.array_equal(again.memory.pairs, stored.pairs)
+    assert np.allclose(again.memory.values[:, columns], stored.values[:, columns], rtol=1e-6, atol=1e-6)
     # all awake, it stays where it is; without the contacts it sinks and jumps more
     moved = {}
     for name, start in (("warm", loaded), ("cold", replace(loaded, contacts=None))):
@@ -219,11 +221,12 @@ def test_rocks_rest_keep_their_forces_and_wake_when_their_load_changes():
     engine, arrays = settle()
     status = arrays.book[:, reduction.STATUS]
     assert (status == 1).mean() > 0.8
-    before = arrays.memory.copy()
+    before = [(*pair, *values) for pair, values in zip(*arrays.memory, strict=True)]
     after, _ = run(engine, arrays, 0.2)
     both_rest = [row for row in before if _rests(row, status, engine.n_rocks)]
-    kept = {tuple(row) for row in after.memory}
-    assert all(tuple(row) in kept for row in both_rest)
+    kept = {(*pair, *values) for pair, values in zip(*after.memory, strict=True)}
+    assert both_rest
+    assert kept.issuperset(both_rest)
     # a heavy rock dropped on the heap wakes what it lands on
     top = int(np.argmax(after.positions[:, 2]))
     heavy = engine.place(
@@ -237,7 +240,7 @@ def test_rocks_rest_keep_their_forces_and_wake_when_their_load_changes():
 
 
 def _rests(row, status, n):
-    a, b = int(row[contacts.MEMORY_FIRST]), int(row[contacts.MEMORY_SECOND])
+    a, b = row[:2]
     return status[a] == 1 and (b >= n or status[b] == 1)
 
 
@@ -258,11 +261,11 @@ def test_contacts_of_slow_rocks_follow_their_motion():
     engine.config = NonsmoothConfig(reduction="none", search_period=1)
     _, report = engine.advance(arrays)
     keys, rows = engine._rows.key[: report.n_contacts], engine._rows.values[: report.n_contacts]
-    memory_keys = np.array([contacts.read_key(arrays.memory, row) for row in range(len(arrays.memory))])
+    memory_keys = np.array([contacts.read_key(arrays.memory, row) for row in range(len(arrays.memory.pairs))])
     pairs = np.intersect1d(keys, memory_keys)
     assert len(pairs) > 60
     found = [rows[keys == key, contacts.GAP].min() for key in pairs]
-    followed = [arrays.memory[memory_keys == key, contacts.MEMORY_GAP].min() for key in pairs]
+    followed = [arrays.memory.values[memory_keys == key, contacts.MEMORY_GAP].min() for key in pairs]
     np.testing.assert_allclose(followed, found, atol=2e-5)
 
 
@@ -345,8 +348,8 @@ def test_two_contexts_keep_their_solutions_apart():
 
 
 def test_memory_keeps_keys_and_simplices_whole():
-    """Their columns are of single precision; the largest numbers have to come back."""
-    memory = np.zeros((1, contacts.MEMORY_WIDTH), np.float32)
+    """A simplex takes two columns of single precision; the largest numbers have to come back."""
+    memory = contacts.make_memory(1)
     rows = contacts.make_contact_rows(1)
     corners = np.array([[127, 126], [125, 127], [127, 127]])
     rows.values[0, [contacts.IMPULSE, contacts.SIMPLEX]] = 1.0, gjk.encode_simplex(corners, 3)
@@ -358,7 +361,7 @@ def test_memory_keeps_keys_and_simplices_whole():
     n, n_idle = contacts.write_memory(
         0,
         empty,
-        memory[:0],
+        contacts.make_memory(0),
         empty,
         0,
         rows,
@@ -696,10 +699,10 @@ def test_a_rock_under_pressure_wakes_by_a_share_of_it(squeeze, wakes):
     book[0, reduction.STATUS] = 1
     book[0, reduction.REFERENCE + 2] = weight
     # Squeezed between two walls, on a floor that carries 0.69 of its weight; half the sizes' sum is the pressure.
-    memory = np.zeros((3, contacts.MEMORY_WIDTH), np.float32)
-    memory[:, contacts.MEMORY_SECOND] = [1, 2, 3]
-    memory[:, contacts.MEMORY_IMPULSE] = [0.0, squeeze * weight, -squeeze * weight]
-    memory[0, contacts.MEMORY_IMPULSE + 2] = -0.69 * weight
+    memory = contacts.make_memory(3)
+    memory.pairs[:, 1] = [1, 2, 3]
+    memory.values[:, contacts.MEMORY_IMPULSE] = [0.0, squeeze * weight, -squeeze * weight]
+    memory.values[0, contacts.MEMORY_IMPULSE + 2] = -0.69 * weight
     nowhere = np.zeros((0, 18))
     alone = np.zeros(1, np.bool_)
     n = reduction.wake(
@@ -712,19 +715,18 @@ def test_a_rock_under_pressure_wakes_by_a_share_of_it(squeeze, wakes):
 def test_a_rock_that_leans_on_a_mover_wakes_sooner_and_does_not_rest(mover):
     """Rock 0 slides at 2 cm/s or 5 mm/s, movers from 1 cm/s; rock 1 leans on it, rock 2 on rock 1."""
     mass, weight = np.full(3, 100.0), 100.0 * 9.81 * 0.01
-    memory = np.zeros((2, contacts.MEMORY_WIDTH), np.float32)
-    memory[:, contacts.MEMORY_FIRST], memory[:, contacts.MEMORY_SECOND] = [0, 1], [1, 2]
+    memory = contacts.make_memory(2)
+    memory.pairs[:] = [[0, 1], [1, 2]]
     book = np.zeros((3, reduction.BOOK_WIDTH))
     book[1:, reduction.STATUS] = RESTING
     velocities, marks = np.zeros((3, 6)), np.zeros(3, np.bool_)
     velocities[0, 5] = 0.02 if mover else 0.005
     # The load of rock 1 has changed by 0.1 of the weight, that of rock 2 by 0.2: 0.3 wakes a rock otherwise.
-    memory[:, contacts.MEMORY_IMPULSE + 2] = [0.1 * weight, 0.2 * weight]
+    memory.values[:, contacts.MEMORY_IMPULSE + 2] = [0.1 * weight, 0.2 * weight]
     reduction.mark_by_movers(book, velocities, memory, 0, 0.01, marks)
     np.testing.assert_array_equal(marks, [False, mover, False])
     # A point about to touch is no contact yet.
-    apart = memory.copy()
-    apart[:, contacts.MEMORY_IMPULSE + 2] = 0.0
+    apart = contacts.Memory(memory.pairs, np.zeros_like(memory.values))
     unmarked = np.ones(3, np.bool_)
     reduction.mark_by_movers(book, velocities, apart, 0, 0.01, unmarked)
     assert not unmarked.any()
@@ -746,8 +748,8 @@ def test_a_rock_that_leans_on_a_mover_wakes_sooner_and_does_not_rest(mover):
 def test_a_rock_wakes_when_what_carried_it_has_left_the_site(other, n_idle, wakes):
     """Rock 0 rests on rock 1. Contacts that were not solved in the last step cannot have changed, and are left out."""
     weight = 100.0 * 9.81 * 0.01
-    memory = np.zeros((1, contacts.MEMORY_WIDTH), np.float32)
-    memory[0, contacts.MEMORY_SECOND], memory[0, contacts.MEMORY_IMPULSE + 2] = 1, -weight
+    memory = contacts.make_memory(1)
+    memory.pairs[0, 1], memory.values[0, contacts.MEMORY_IMPULSE + 2] = 1, -weight
     book = np.zeros((2, reduction.BOOK_WIDTH))
     book[:, reduction.STATUS] = RESTING, other
     book[:, reduction.REFERENCE + 2] = np.float32(weight), -np.float32(weight)

@@ -42,21 +42,20 @@ from drakerock.dynamics.nonsmooth.contacts import (
     GAP,
     IMPULSE,
     KEY_STEP,
-    MEMORY_FIRST,
     MEMORY_GAP,
-    MEMORY_IMPULSE,
     MEMORY_NORMAL,
     MEMORY_POINT,
-    MEMORY_SECOND,
     NORMAL,
     RESTITUTION,
     SIMPLEX,
     TANGENT_1,
     TANGENT_2,
     ContactRows,
+    Memory,
     find_axis,
     find_in_memory,
     is_loaded,
+    read_impulse,
     read_key,
     read_simplex,
 )
@@ -218,7 +217,7 @@ def _write_row(
 
 @kernel
 def _follow_row(
-    memory: Array, row: int, bodies: CollisionBodies, restitution: Array, rows: ContactRows, n_rows: int
+    memory: Memory, row: int, bodies: CollisionBodies, restitution: Array, rows: ContactRows, n_rows: int
 ) -> int:
     """Set a contact row from the memory; return the number of rows.
 
@@ -226,29 +225,21 @@ def _follow_row(
     order in the pair's own motion, fractions of a millimetre.
     """
     if n_rows < len(rows.values):
-        a, b = int(memory[row, MEMORY_FIRST]), int(memory[row, MEMORY_SECOND])
+        a, b = int(memory.pairs[row, 0]), int(memory.pairs[row, 1])
+        values = memory.values[row]
         r_a = get_rotation(bodies.rotations, a)
-        point = rotate(
-            r_a, memory[row, MEMORY_POINT], memory[row, MEMORY_POINT + 1], memory[row, MEMORY_POINT + 2]
-        )
-        normal = rotate(
-            r_a, memory[row, MEMORY_NORMAL], memory[row, MEMORY_NORMAL + 1], memory[row, MEMORY_NORMAL + 2]
-        )
-        impulse = (
-            float(memory[row, MEMORY_IMPULSE]),
-            float(memory[row, MEMORY_IMPULSE + 1]),
-            float(memory[row, MEMORY_IMPULSE + 2]),
-        )
+        point = rotate(r_a, values[MEMORY_POINT], values[MEMORY_POINT + 1], values[MEMORY_POINT + 2])
+        normal = rotate(r_a, values[MEMORY_NORMAL], values[MEMORY_NORMAL + 1], values[MEMORY_NORMAL + 2])
         _write_row(
-            rows, n_rows, bodies, a, b, normal, point, float(memory[row, MEMORY_GAP]), impulse, restitution[0],
-            read_simplex(memory, row),
+            rows, n_rows, bodies, a, b, normal, point, float(values[MEMORY_GAP]), read_impulse(memory, row),
+            restitution[0], read_simplex(memory, row),
         )  # fmt: skip
     return n_rows + 1
 
 
 @kernel
 def follow_contacts(
-    memory: Array,
+    memory: Memory,
     active: Array,
     n_active: int,
     calm: Array,
@@ -270,7 +261,7 @@ def follow_contacts(
     n_rows = 0
     for k in range(n_active):
         row = active[k]
-        if calm[int(memory[row, MEMORY_FIRST])] == CALM and calm[int(memory[row, MEMORY_SECOND])] == CALM:
+        if calm[memory.pairs[row, 0]] == CALM and calm[memory.pairs[row, 1]] == CALM:
             n_rows = _follow_row(memory, row, bodies, restitution, rows, n_rows)
     return n_rows
 
@@ -311,7 +302,7 @@ def find_contacts(
     max_points: int,
     calm: Array,
     slow_speed: float,
-    memory: Array,
+    memory: Memory,
     table: Array,
     axis_keys: Array,
     axes: Array,
@@ -371,7 +362,7 @@ def find_contacts(
             and _calc_own_speed(positions, velocities, a, b, scale[b] * shapes.radius[shape[b]]) < slow_speed
         ):
             row = remembered
-            while row < len(memory) and read_key(memory, row) == key:
+            while row < len(memory.pairs) and read_key(memory, row) == key:
                 n_rows = _follow_row(memory, row, bodies, restitution, rows, n_rows)
                 row += 1
             continue
@@ -380,16 +371,15 @@ def find_contacts(
         n_known = 0
         if remembered >= 0:
             row = remembered
-            while row < len(memory) and read_key(memory, row) == key:
-                hx += memory[row, MEMORY_IMPULSE]
-                hy += memory[row, MEMORY_IMPULSE + 1]
-                hz += memory[row, MEMORY_IMPULSE + 2]
+            while row < len(memory.pairs) and read_key(memory, row) == key:
+                ix, iy, iz = read_impulse(memory, row)
+                hx, hy, hz = hx + ix, hy + iy, hz + iz
                 if n_known < MAX_POINTS and is_loaded(memory, row):
                     known_points[n_known, 0], known_points[n_known, 1], known_points[n_known, 2] = rotate(
                         r_a,
-                        memory[row, MEMORY_POINT],
-                        memory[row, MEMORY_POINT + 1],
-                        memory[row, MEMORY_POINT + 2],
+                        memory.values[row, MEMORY_POINT],
+                        memory.values[row, MEMORY_POINT + 1],
+                        memory.values[row, MEMORY_POINT + 2],
                     )
                     n_known += 1
                 row += 1
@@ -488,11 +478,11 @@ def find_contacts(
                 nearest = match_limit * match_limit
                 found = -1
                 row = remembered
-                while row < len(memory) and read_key(memory, row) == key:
+                while row < len(memory.pairs) and read_key(memory, row) == key:
                     distance2 = (
-                        (memory[row, MEMORY_POINT] - lx) ** 2
-                        + (memory[row, MEMORY_POINT + 1] - ly) ** 2
-                        + (memory[row, MEMORY_POINT + 2] - lz) ** 2
+                        (memory.values[row, MEMORY_POINT] - lx) ** 2
+                        + (memory.values[row, MEMORY_POINT + 1] - ly) ** 2
+                        + (memory.values[row, MEMORY_POINT + 2] - lz) ** 2
                     )
                     if distance2 < nearest and (used >> (row - remembered)) & 1 == 0:
                         nearest = distance2
@@ -500,11 +490,7 @@ def find_contacts(
                     row += 1
                 if found >= 0:
                     used |= 1 << (found - remembered)
-                    ix, iy, iz = (
-                        float(memory[found, MEMORY_IMPULSE]),
-                        float(memory[found, MEMORY_IMPULSE + 1]),
-                        float(memory[found, MEMORY_IMPULSE + 2]),
-                    )
+                    ix, iy, iz = read_impulse(memory, found)
             _write_row(
                 rows, n_rows, bodies, a, b, (nx, ny, nz), (x, y, z), points[k, 3], (ix, iy, iz),
                 restitution[1] if body_2 > n_rocks else restitution[0], simplex,
