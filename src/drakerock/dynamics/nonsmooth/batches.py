@@ -32,7 +32,7 @@ from drakerock.dynamics.nonsmooth.contacts import (
     TANGENT_MASS,
     TANGENT_STEP,
 )
-from drakerock.dynamics.nonsmooth.lanes import INTEGER, LANES, WIDTH, Lanes, gather, scatter
+from drakerock.dynamics.nonsmooth.lanes import INTEGER, LANES, WIDTH, Lanes, gather, make_zeros, scatter
 from drakerock.dynamics.nonsmooth.solver import BODY_WIDTH
 
 # A vector each of the contacts of a batch: three numbers, in all lanes.
@@ -67,10 +67,10 @@ class BatchArrays(NamedTuple):
 def make_batch_arrays(n_rows: int) -> BatchArrays:
     """Return room for as many rows, if need be each in a batch of its own; what is not used takes no memory."""
     return BatchArrays(
-        np.zeros((n_rows, LANES), np.int32),
-        np.zeros((n_rows, FIELDS, LANES), np.float32),
-        np.zeros((n_rows, 2, LANES), np.int32),
-        np.zeros(LANES, np.float32),
+        make_zeros((n_rows, LANES), np.int32),
+        make_zeros((n_rows, FIELDS, LANES), np.float32),
+        make_zeros((n_rows, 2, LANES), np.int32),
+        make_zeros((LANES,), np.float32),
     )
 
 

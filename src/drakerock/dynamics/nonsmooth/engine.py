@@ -20,6 +20,7 @@ from drakerock.dynamics.nonsmooth.collision import broad_phase, narrow_phase
 from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, FIXED, LOST, RESTING
 from drakerock.dynamics.nonsmooth.collision.shapes import make_convex_shapes
 from drakerock.dynamics.nonsmooth.compiling import announce_compilation
+from drakerock.dynamics.nonsmooth.lanes import make_zeros
 from drakerock.dynamics.nonsmooth.solver import MachineArrays
 from drakerock.errors import SimulationFailure
 from drakerock.pile.config import RocksConfig
@@ -259,7 +260,7 @@ class NonsmoothEngine:
         self._stale = np.zeros(n, np.int64)
         self._near = np.zeros(n, np.int64)
         self._bodies = np.zeros((n + 1, solver.BODY_WIDTH))
-        self._bodies_32 = np.zeros((n + 1, solver.BODY_WIDTH), np.float32)
+        self._bodies_32 = make_zeros((n + 1, solver.BODY_WIDTH), np.float32)
         # Zero between steps, for the rocks.
         self._velocities = np.zeros((n + 1 + self.n_machine_bodies, 6))
         self._marks = np.zeros(n + 1 + self.n_machine_bodies, np.int64)
@@ -271,7 +272,7 @@ class NonsmoothEngine:
         self._axes = np.zeros((places, 3), np.float32)
         self._statistics = np.zeros(4, np.int64)
         self._narrow_workspace = narrow_phase.make_workspace()
-        self._by_movers = np.zeros(n, np.bool_)
+        self._movers, self._by_movers = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         # What is no rock does not move, or is searched with what does.
         self._calm = np.full(n_bodies, broad_phase.SEARCHED, np.int8)
         self._calm[n : self.first_piece] = broad_phase.CALM
@@ -471,8 +472,9 @@ class NonsmoothEngine:
         n_woken = 0
         if config.reduction == "rest":
             reduction.mark_by_movers(
-                book, arrays.velocities, memory, arrays.n_idle, config.rest.mover_speed, self._by_movers
-            )
+                book, arrays.velocities, memory, arrays.n_idle, config.rest.mover_speed,
+                self._movers, self._by_movers,
+            )  # fmt: skip
             n_woken = reduction.wake(
                 book,
                 arrays.positions,
@@ -562,8 +564,9 @@ class NonsmoothEngine:
         self._velocities[awake] = 0.0
         if config.reduction == "rest":
             reduction.mark_by_movers(
-                book, new.velocities, new.memory, n_idle, config.rest.mover_speed, self._by_movers
-            )
+                book, new.velocities, new.memory, n_idle, config.rest.mover_speed,
+                self._movers, self._by_movers,
+            )  # fmt: skip
         n_rested, n_lost = reduction.rest(
             book, new.positions, new.velocities, self.radius, machine.sensors, self._by_movers, dt,
             config.rest.displacement, config.rest.time, config.rest.speed, self._lower_site, self._upper_site,

@@ -56,7 +56,13 @@ def is_sensed(x: float, y: float, z: float, radius: float, sensors: Array) -> bo
 
 @kernel
 def mark_by_movers(
-    book: Array, velocities: Array, memory: Memory, n_idle: int, mover_speed: float, marks: Array
+    book: Array,
+    velocities: Array,
+    memory: Memory,
+    n_idle: int,
+    mover_speed: float,
+    movers: Array,
+    marks: Array,
 ) -> None:
     """Mark the rocks that share a loaded contact with a mover.
 
@@ -65,17 +71,18 @@ def mark_by_movers(
         velocities: (n, 6).
         memory, n_idle: loaded contact points, see `contacts`; the first so many are of rocks at rest.
         mover_speed: awake rocks that are faster are movers [m/s].
-        marks: (n,) bool, set.
+        movers: (n,) bool, set.
+        marks: (n,) bool, set: the rocks that lean on one.
     """
     n = len(book)
     marks[:] = False
+    for i in range(n):
+        movers[i] = _moves(book, velocities, i, mover_speed)
     for row in range(n_idle, len(memory.pairs)):
         a, b = memory.pairs[row, 0], memory.pairs[row, 1]
-        if b < n and is_loaded(memory, row):
-            if _moves(book, velocities, a, mover_speed):
-                marks[b] = True
-            if _moves(book, velocities, b, mover_speed):
-                marks[a] = True
+        if b < n and (movers[a] or movers[b]) and is_loaded(memory, row):
+            marks[a] |= movers[b]
+            marks[b] |= movers[a]
 
 
 @kernel

@@ -55,6 +55,12 @@ def test_batches_hold_every_row_once_and_no_rock_twice(seed, n_rows, n_rocks):
         assert len(rocks) == len(set(rocks))
 
 
+def test_no_vector_of_a_batch_lies_across_two_lines_of_the_cache():
+    for room in batches.make_batch_arrays(7):
+        assert room.ctypes.data % 64 == 0
+        assert not room.any()
+
+
 def test_a_batch_is_updated_like_its_rows_one_by_one():
     """Sticking, sliding and parting contacts: sixteen at once in single precision, against the scalar update."""
     rng = np.random.default_rng(3)

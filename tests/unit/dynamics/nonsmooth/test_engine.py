@@ -719,16 +719,17 @@ def test_a_rock_that_leans_on_a_mover_wakes_sooner_and_does_not_rest(mover):
     memory.pairs[:] = [[0, 1], [1, 2]]
     book = np.zeros((3, reduction.BOOK_WIDTH))
     book[1:, reduction.STATUS] = RESTING
-    velocities, marks = np.zeros((3, 6)), np.zeros(3, np.bool_)
+    velocities, movers, marks = np.zeros((3, 6)), np.zeros(3, np.bool_), np.zeros(3, np.bool_)
     velocities[0, 5] = 0.02 if mover else 0.005
     # The load of rock 1 has changed by 0.1 of the weight, that of rock 2 by 0.2: 0.3 wakes a rock otherwise.
     memory.values[:, contacts.MEMORY_IMPULSE + 2] = [0.1 * weight, 0.2 * weight]
-    reduction.mark_by_movers(book, velocities, memory, 0, 0.01, marks)
+    reduction.mark_by_movers(book, velocities, memory, 0, 0.01, movers, marks)
+    np.testing.assert_array_equal(movers, [mover, False, False])
     np.testing.assert_array_equal(marks, [False, mover, False])
     # A point about to touch is no contact yet.
     apart = contacts.Memory(memory.pairs, np.zeros_like(memory.values))
     unmarked = np.ones(3, np.bool_)
-    reduction.mark_by_movers(book, velocities, apart, 0, 0.01, unmarked)
+    reduction.mark_by_movers(book, velocities, apart, 0, 0.01, movers, unmarked)
     assert not unmarked.any()
     nowhere, limits = np.zeros((0, 18)), (0.3 * 9.81 * 0.01, 0.0, 0.1, 1)
     reduction.wake(book, np.zeros((3, 3)), np.ones(3), mass, memory, 0, nowhere, marks, *limits)
