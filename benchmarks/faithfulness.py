@@ -111,8 +111,11 @@ VARIANTS: dict[str, tuple[dict[str, object], float]] = {
     ),
     "no-machine-sweeps": ({"reduction": "none", "machine_sweeps": 0}, TIME_STEP),
     "none-200": ({"reduction": "none", "iterations": 200}, TIME_STEP),
+    "rest-200": ({"reduction": "rest", "iterations": 200}, TIME_STEP),
     "converged": ({"reduction": "none", "iterations": 400}, TIME_STEP),
 }
+# With reduction, what the two baselines of `table` are without.
+REDUCED = ("rest", "rest-200")
 # Making a pile costs as much as several digs; each is at another place and depth.
 DIGS_PER_PILE = 5
 CYCLE_METRICS = (
@@ -359,27 +362,36 @@ def compare(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
 
 
 def print_table(out: Path, baselines: Sequence[str] = ("none", "none-200")) -> None:
-    """Print the tables of digs and of cycles; cycles that failed in either variant are left out."""
+    """Print the tables of digs and of cycles; cycles that failed in a variant are left out.
+
+    The last row of a size is the effect of the reduction at both numbers of sweeps, from the means of the two.
+    """
     for suffix, metrics in (("", METRICS), ("-cycles", CYCLE_METRICS)):
         print("| rocks | variant | against | pairs | " + " | ".join(metrics) + " |")
         print("|---|---|---|---|" + "---|" * len(metrics))
-        for size, baseline in product(SIZES, baselines):
+        pairs = [
+            ((variant,), (baseline,))
+            for baseline, variant in product(baselines, VARIANTS)
+            if variant != baseline
+        ]
+        for size, (variants, others) in product(SIZES, [*pairs, (REDUCED, baselines)]):
             results = {
                 (r["variant"], r["seed"]): r for r in read(out / f"{size}{suffix}.jsonl") if "cpu_s" in r
             }
-            for variant in VARIANTS:
-                if variant == baseline:
-                    continue
-                seeds = [s for v, s in results if v == variant and (baseline, s) in results]
-                if len(seeds) < 3:
-                    continue
-                cells = []
-                for metric in metrics:
-                    a = np.array([results[variant, s][metric] for s in seeds])
-                    b = np.array([results[baseline, s][metric] for s in seeds])
-                    mean, half = compare(a, b)
-                    cells.append(f"{100 * mean / b.mean():+.1f} ± {100 * half / b.mean():.1f} %")
-                print(f"| {size} | {variant} | {baseline} | {len(seeds)} | " + " | ".join(cells) + " |")
+            seeds = [s for v, s in results if v == variants[0]]
+            seeds = [s for s in seeds if all((name, s) in results for name in (*variants, *others))]
+            if len(seeds) < 3:
+                continue
+            cells = []
+            for metric in metrics:
+                a, b = (
+                    np.array([np.mean([results[name, s][metric] for name in names]) for s in seeds])
+                    for names in (variants, others)
+                )
+                mean, half = compare(a, b)
+                cells.append(f"{100 * mean / b.mean():+.1f} ± {100 * half / b.mean():.1f} %")
+            names = " and ".join(variants), " and ".join(others)
+            print(f"| {size} | {names[0]} | {names[1]} | {len(seeds)} | " + " | ".join(cells) + " |")
         print()
 
 
