@@ -374,10 +374,12 @@ def print_table(out: Path, baselines: Sequence[str] = ("none", "none-200")) -> N
             for baseline, variant in product(baselines, VARIANTS)
             if variant != baseline
         ]
+        stored = {
+            size: {(r["variant"], r["seed"]): r for r in read(out / f"{size}{suffix}.jsonl") if "cpu_s" in r}
+            for size in SIZES
+        }
         for size, (variants, others) in product(SIZES, [*pairs, (REDUCED, baselines)]):
-            results = {
-                (r["variant"], r["seed"]): r for r in read(out / f"{size}{suffix}.jsonl") if "cpu_s" in r
-            }
+            results = stored[size]
             seeds = [s for v, s in results if v == variants[0]]
             seeds = [s for s in seeds if all((name, s) in results for name in (*variants, *others))]
             if len(seeds) < 3:
