@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drakerock.dynamics.config import NonsmoothConfig
 from drakerock.dynamics.nonsmooth import contacts, motion, reduction, resting, solver
 from drakerock.dynamics.nonsmooth.batches import make_batch_arrays
-from drakerock.dynamics.nonsmooth.collision import broad_phase, narrow_phase
+from drakerock.dynamics.nonsmooth.collision import broad_phase, foresight, narrow_phase
 from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, FIXED, LOST, RESTING
 from drakerock.dynamics.nonsmooth.collision.shapes import make_convex_shapes
 from drakerock.dynamics.nonsmooth.compiling import announce_compilation
@@ -44,6 +44,8 @@ SITE_MARGIN = 0.5
 # presses into a jammed pile passes on little of the machine's momentum per iteration, and is squeezed meanwhile.
 RETRY_FACTOR = 4
 DEEP_SHARE = 0.375
+# One that would make an overlap beyond this share is solved again, with contacts where its own motion would lead.
+FORESEEN_SHARE = 0.75
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,8 @@ class StepReport:
         residual: the last one's change of the normal impulses over their sum or the weight, see `solve_resting`.
         max_penetration, p99_penetration: of loaded points [m].
         n_woken, n_rested, n_lost: rocks that changed state (lost: left the site) in this step.
-        redone: the step was solved again with more iterations.
+        n_foreseen: loaded pairs that the step drives deep into each other, see `foresight`.
+        redone: the step was solved again, with more iterations.
         flagged: it had to be redone, or penetration is beyond the bound of the settings.
         overflow: loaded points that memory could not take.
     """
@@ -134,6 +137,7 @@ class StepReport:
     n_woken: int
     n_rested: int
     n_lost: int
+    n_foreseen: int
     redone: bool
     flagged: bool
     overflow: int
@@ -277,6 +281,8 @@ class NonsmoothEngine:
         self._calm = np.full(n_bodies, broad_phase.SEARCHED, np.int8)
         self._calm[n : self.first_piece] = broad_phase.CALM
         self._seeks = np.zeros(n, np.bool_)
+        # Set by a solve, for one that repeats it.
+        self._foreseen = np.zeros(n_bodies)
         self._allocate_pairs(20 * n + 256)
         self._allocate_rows(6 * n + 256)
         for k in range(n, self.first_plane):
@@ -436,13 +442,20 @@ class NonsmoothEngine:
             if not motion.are_finite(getattr(arrays, name)):
                 raise SimulationFailure(f"rocks: {name} that are not finite")
         iterations, momentum = self.config.iterations, self.config.momentum
+        self._foreseen[:] = 0.0
         if room is None:
             room = self.make_room()
             for name in MOTION:
                 getattr(room, name)[:] = getattr(arrays, name)
         new, report = self._try_step(arrays, machine, room, iterations, momentum, warm=True, search_all=False)
         if new is not None and report is not None and report.residual <= self.config.max_residual:
-            return new, report
+            if report.n_foreseen == 0:
+                return new, report
+            new, report = self._try_step(
+                arrays, machine, room, RETRY_FACTOR * iterations, momentum, warm=True, search_all=True
+            )
+            if new is not None and report is not None and report.residual <= self.config.max_residual:
+                return new, _mark_redone(report)
         again, better = self._try_step(
             arrays, machine, room, RETRY_FACTOR * iterations, 0.0, warm=new is not None, search_all=True
         )
@@ -561,6 +574,11 @@ class NonsmoothEngine:
             2.0 * config.search_distance, new.memory,
         )  # fmt: skip
         new.memory, new.n_idle = new.memory.select(slice(n_memory)), n_idle
+        self._velocities[n + 1 :] = machine.arrays.jacobian @ velocity
+        n_foreseen = foresight.foresee_overlaps(
+            self._rows, n_rows, self.first_plane, self.first_piece, self.planes, self.convex, self._collision_bodies,
+            self._velocities, dt, FORESEEN_SHARE * config.max_penetration, self._foreseen, self._narrow_workspace,
+        )  # fmt: skip
         self._velocities[awake] = 0.0
         if config.reduction == "rest":
             reduction.mark_by_movers(
@@ -591,6 +609,7 @@ class NonsmoothEngine:
             n_woken=n_woken,
             n_rested=n_rested,
             n_lost=n_lost,
+            n_foreseen=n_foreseen,
             redone=False,
             flagged=max_penetration > config.max_penetration,
             overflow=n_memory - len(new.memory.pairs),
@@ -614,6 +633,10 @@ class NonsmoothEngine:
             self.convex, self._stale[:n_stale], bodies.rotations, self._lower, self._upper,
             self.inverse_inertia_local, self._inverse_inertia,
         )  # fmt: skip
+        # Boxes of others are kept from step to step.
+        driven = np.flatnonzero((self._foreseen[:n] > 0.0) & (status == AWAKE))
+        self._lower[driven] -= dt * self._foreseen[driven, None]
+        self._upper[driven] += dt * self._foreseen[driven, None]
         broad_phase.calc_piece_boxes(
             self.first_piece, self.piece_body, bodies.shape, self.convex, machine.X_WBs,
             self._velocities[n + 1 :], dt, margin, bodies.positions, bodies.rotations, self._lower, self._upper,
@@ -691,8 +714,8 @@ class NonsmoothEngine:
                 self._pair_a, self._pair_b, n_pairs, self.n_rocks, self.first_plane, self.first_piece,
                 self.planes, self.convex, self._collision_bodies, self._velocities, self.restitution,
                 self.time_step, config.contact_margin, config.manifold_gap, config.face_cosine,
-                config.manifold_points, self._calm, config.slow_speed, memory, table, self._axis_keys, self._axes,
-                self._rows, n_rows, self._statistics, self._narrow_workspace,
+                config.manifold_points, self._calm, config.slow_speed, self._foreseen, memory, table, self._axis_keys,
+                self._axes, self._rows, n_rows, self._statistics, self._narrow_workspace,
             )  # fmt: skip
             if n_rows <= len(self._rows.values):
                 return int(n_rows)

@@ -302,6 +302,7 @@ def find_contacts(
     max_points: int,
     calm: Array,
     slow_speed: float,
+    foreseen: Array,
     memory: Memory,
     table: Array,
     axis_keys: Array,
@@ -328,6 +329,7 @@ def find_contacts(
         max_points: points of a pair, MAX_POINTS at most.
         calm: per body CALM, COMOVING or SEARCHED, see `broad_phase`.
         slow_speed: pairs of rocks that are not SEARCHED, slower than this against each other, follow [m/s].
+        foreseen: per body, by how much its pairs may be faster than before the step, see `foresight` [m/s].
         memory, table: loaded points of the last step, see `contacts`.
         axis_keys, axes: cache of separating axes: skips pairs, never changes a result.
         rows: set from `n_rows` on.
@@ -352,7 +354,7 @@ def find_contacts(
         for d in range(3, 6):
             speed2 += (velocities[body_1, d] - velocities[body_2, d]) ** 2
         spin_a = math.sqrt(velocities[a, 0] ** 2 + velocities[a, 1] ** 2 + velocities[a, 2] ** 2)
-        reach = math.sqrt(speed2) + spin_a * scale_a * shapes.radius[shape_a]
+        reach = math.sqrt(speed2) + spin_a * scale_a * shapes.radius[shape_a] + max(foreseen[a], foreseen[b])
         remembered = find_in_memory(key, memory, table)
         if (
             remembered >= 0
