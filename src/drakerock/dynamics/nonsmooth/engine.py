@@ -271,9 +271,11 @@ class NonsmoothEngine:
         self._active = np.zeros(self.capacity, np.int64)
         self._table = np.zeros(1 << int(np.ceil(np.log2(2 * self.capacity))), np.int64)
         # Places for the pairs that are near but apart; what is pushed out is searched anew, no more.
-        places = 1 << int(np.ceil(np.log2(max(16 * n, 1024))))
-        self._axis_keys = np.full(places, -1, np.int64)
-        self._axes = np.zeros((places, 3), np.float32)
+        places = 1 << int(np.ceil(np.log2(max(4 * n, 1024))))
+        # Key and axis of a place beside each other: they come with one line of the cache.
+        records = make_zeros((places, 8), np.float32)
+        self._axis_keys, self._axes = records.view(np.int64)[:, 0], records[:, 2:5]
+        self._axis_keys[:] = -1
         self._statistics = np.zeros(4, np.int64)
         self._narrow_workspace = narrow_phase.make_workspace()
         self._movers, self._by_movers = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
@@ -296,6 +298,8 @@ class NonsmoothEngine:
     def _allocate_pairs(self, capacity: int) -> None:
         self._pair_a = np.zeros(capacity, np.int64)
         self._pair_b = np.zeros(capacity, np.int64)
+        self._remembered = np.zeros(capacity, np.int64)
+        self._known_axes = np.zeros((capacity, 3), np.float32)
 
     def _allocate_rows(self, capacity: int) -> None:
         self._rows = contacts.make_contact_rows(capacity)
@@ -715,7 +719,8 @@ class NonsmoothEngine:
                 self.planes, self.convex, self._collision_bodies, self._velocities, self.restitution,
                 self.time_step, config.contact_margin, config.manifold_gap, config.face_cosine,
                 config.manifold_points, self._calm, config.slow_speed, self._foreseen, memory, table, self._axis_keys,
-                self._axes, self._rows, n_rows, self._statistics, self._narrow_workspace,
+                self._axes, self._remembered, self._known_axes, self._rows, n_rows, self._statistics,
+                self._narrow_workspace,
             )  # fmt: skip
             if n_rows <= len(self._rows.values):
                 return int(n_rows)
