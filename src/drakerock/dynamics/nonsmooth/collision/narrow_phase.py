@@ -297,7 +297,7 @@ def _look_up_pairs(
     """Set each pair's first row in memory (-1: none) and its separating axis, all zero if it is not known.
 
     Both are anywhere in large tables. Looked up for one pair after the other, with nothing else between, the processor
-    fetches several at once; each before its pair's search, they took a third of the narrow phase.
+    fetches several at once.
     """
     for pair in range(n_pairs):
         key = pair_a[pair] * KEY_STEP + pair_b[pair]
