@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drakerock.dynamics.nonsmooth.compiling import Array, Vector, kernel
+from drakerock.dynamics.nonsmooth.lanes import make_zeros
 
 # Columns of a contact row. All vectors in W; impulses act on body B, and reversed on body A.
 NORMAL = 0  # 0..2 unit normal from A to B
@@ -86,6 +87,28 @@ class Memory(NamedTuple):
 def make_memory(n: int) -> Memory:
     """Return memory of so many points, all zero."""
     return Memory(np.zeros((n, 2), np.int32), np.zeros((n, MEMORY_WIDTH), np.float32))
+
+
+class AxisCache(NamedTuple):
+    """The separating axes of pairs that are near but apart: places for p of them, found by their key.
+
+    Attributes:
+        keys: (p,) key of the pair at each place, or -1.
+        axes: (p, 3) float32 its axis, any length.
+    """
+
+    keys: NDArray[np.int64]
+    axes: NDArray[np.float32]
+
+
+def make_axis_cache(n: int) -> AxisCache:
+    """Return an empty cache with room for at least so many pairs."""
+    places = 1 << int(np.ceil(np.log2(n)))
+    # Key and axis of a place beside each other: they come with one line of the processor's cache.
+    records = make_zeros((places, 8), np.float32)
+    cache = AxisCache(records.view(np.int64)[:, 0], records[:, 2:5])
+    cache.keys[:] = -1
+    return cache
 
 
 def make_contact_rows(capacity: int) -> ContactRows:
@@ -184,10 +207,10 @@ def find_in_memory(key: int, memory: Memory, table: Array) -> int:
 
 
 @kernel
-def find_axis(key: int, axis_keys: Array) -> tuple[int, bool]:
+def find_axis(key: int, cache: AxisCache) -> tuple[int, bool]:
     """Return the place of a pair in the cache of separating axes, and whether it is the pair's own."""
-    place = _hash(key, len(axis_keys) - 1)
-    return place, axis_keys[place] == key
+    place = _hash(key, len(cache.keys) - 1)
+    return place, cache.keys[place] == key
 
 
 @kernel

@@ -271,11 +271,7 @@ class NonsmoothEngine:
         self._active = np.zeros(self.capacity, np.int64)
         self._table = np.zeros(1 << int(np.ceil(np.log2(2 * self.capacity))), np.int64)
         # Places for the pairs that are near but apart; what is pushed out is searched anew, no more.
-        places = 1 << int(np.ceil(np.log2(max(4 * n, 1024))))
-        # Key and axis of a place beside each other: they come with one line of the cache.
-        records = make_zeros((places, 8), np.float32)
-        self._axis_keys, self._axes = records.view(np.int64)[:, 0], records[:, 2:5]
-        self._axis_keys[:] = -1
+        self._axis_cache = contacts.make_axis_cache(max(4 * n, 1024))
         self._statistics = np.zeros(4, np.int64)
         self._narrow_workspace = narrow_phase.make_workspace()
         self._movers, self._by_movers = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
@@ -718,8 +714,8 @@ class NonsmoothEngine:
                 self._pair_a, self._pair_b, n_pairs, self.n_rocks, self.first_plane, self.first_piece,
                 self.planes, self.convex, self._collision_bodies, self._velocities, self.restitution,
                 self.time_step, config.contact_margin, config.manifold_gap, config.face_cosine,
-                config.manifold_points, self._calm, config.slow_speed, self._foreseen, memory, table, self._axis_keys,
-                self._axes, self._remembered, self._known_axes, self._rows, n_rows, self._statistics,
+                config.manifold_points, self._calm, config.slow_speed, self._foreseen, memory, table,
+                self._axis_cache, self._remembered, self._known_axes, self._rows, n_rows, self._statistics,
                 self._narrow_workspace,
             )  # fmt: skip
             if n_rows <= len(self._rows.values):

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import math
 
-from drakerock.dynamics.nonsmooth.collision.geometry import get_corner, get_rotation
-from drakerock.dynamics.nonsmooth.collision.gjk import NEAR, OVERLAPPING, calc_core_distance
+from drakerock.dynamics.nonsmooth.collision.geometry import calc_support_distance, get_rotation
 from drakerock.dynamics.nonsmooth.collision.narrow_phase import (
-    MIN_COSINE_TO_HISTORY,
     CollisionBodies,
     Workspace,
+    calc_signed_core_distance,
 )
-from drakerock.dynamics.nonsmooth.collision.overlap import calc_core_penetration
 from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
 from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, Vector, kernel
 from drakerock.dynamics.nonsmooth.contacts import GAP, IMPULSE, KEY_STEP, NORMAL, ContactRows
@@ -63,17 +61,6 @@ def _calc_squared_turning(
     v = velocities[bodies.solver_body[body]]
     radius = bodies.scale[body] * shapes.radius[bodies.shape[body]]
     return float(radius * radius * (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]))
-
-
-@kernel
-def _calc_plane_gap(
-    shapes: ConvexShapes, shape: int, scale: float, r: Rotation, p: Vector, plane: Array
-) -> float:
-    least = math.inf
-    for k in range(shapes.vertex_start[shape], shapes.vertex_start[shape + 1]):
-        x, y, z = get_corner(shapes.vertices, k, scale, r)
-        least = min(least, plane[0] * (p[0] + x) + plane[1] * (p[1] + y) + plane[2] * (p[2] + z) - plane[3])
-    return float(least - scale * shapes.rounding[shape])
 
 
 @kernel
@@ -135,28 +122,24 @@ def foresee_overlaps(
             continue
         r_a, p_a = _calc_pose_after(bodies, velocities, a, time_step)
         shape_a, scale_a = bodies.shape[a], bodies.scale[a]
-        gap = 0.0
+        gap = -scale_a * shapes.rounding[shape_a]
         if is_plane:
-            gap = _calc_plane_gap(shapes, shape_a, scale_a, r_a, p_a, planes[b - first_plane])
+            plane = planes[b - first_plane]
+            gap += plane[0] * p_a[0] + plane[1] * p_a[1] + plane[2] * p_a[2] - plane[3]
+            gap -= calc_support_distance(shapes, shape_a, scale_a, r_a, -plane[0], -plane[1], -plane[2])
         else:
             r_b, p_b = _calc_pose_after(bodies, velocities, b, time_step)
             shape_b, scale_b = bodies.shape[b], bodies.scale[b]
             px, py, pz = p_b[0] - p_a[0], p_b[1] - p_a[1], p_b[2] - p_a[2]
             values = rows.values[first]
             nx, ny, nz = values[NORMAL], values[NORMAL + 1], values[NORMAL + 2]
-            roundings = scale_a * shapes.rounding[shape_a] + scale_b * shapes.rounding[shape_b]
-            status, vx, vy, vz, _, _, _, _ = calc_core_distance(
-                shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, nx, ny, nz, 0, roundings,
+            gap -= scale_b * shapes.rounding[shape_b]
+            # Separated by more than their roundings, they do not touch.
+            _, distance, _, _, _, _, _, _, _ = calc_signed_core_distance(
+                shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, nx, ny, nz, nx, ny, nz, 0, -gap,
                 workspace[0],
             )  # fmt: skip
-            if status == NEAR:
-                gap = math.sqrt(vx * vx + vy * vy + vz * vz) - roundings
-            elif status == OVERLAPPING:
-                separation, _, _, _, _, _, _ = calc_core_penetration(
-                    shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, nx, ny, nz,
-                    MIN_COSINE_TO_HISTORY,
-                )  # fmt: skip
-                gap = separation - roundings
+            gap += distance
         if -gap > least:
             speeds[a] = max(speeds[a], speed)
             speeds[b] = max(speeds[b], speed)

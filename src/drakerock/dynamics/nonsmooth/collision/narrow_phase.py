@@ -50,6 +50,7 @@ from drakerock.dynamics.nonsmooth.contacts import (
     SIMPLEX,
     TANGENT_1,
     TANGENT_2,
+    AxisCache,
     ContactRows,
     Memory,
     find_axis,
@@ -283,14 +284,74 @@ def _calc_own_speed(positions: Array, velocities: Array, a: int, b: int, radius_
 
 
 @kernel
+def calc_signed_core_distance(
+    shapes: ConvexShapes,
+    shape_a: int,
+    scale_a: float,
+    r_a: Rotation,
+    shape_b: int,
+    scale_b: float,
+    r_b: Rotation,
+    px: float,
+    py: float,
+    pz: float,
+    gx: float,
+    gy: float,
+    gz: float,
+    hx: float,
+    hy: float,
+    hz: float,
+    simplex: int,
+    max_distance: float,
+    workspace: GjkWorkspace,
+) -> tuple[int, float, float, float, float, float, float, float, int]:
+    """Find how far two cores are apart, or how deep they are in each other.
+
+    Args:
+        shapes, ..., pz, gx, gy, gz, simplex, max_distance, workspace: as for `calc_core_distance`.
+        hx, hy, hz: as for `calc_core_penetration`.
+
+    Returns:
+        ``(status, distance, nx, ny, nz, ax, ay, az, simplex)``: status and simplex as of `calc_core_distance`, the
+        distance (negative: overlap), the unit normal from A to B, and A's point. SEPARATED: n an axis that tells the
+        cores apart, of any length; distance and point of no use.
+    """
+    status, vx, vy, vz, ax, ay, az, simplex = calc_core_distance(
+        shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, gx, gy, gz, simplex, max_distance,
+        workspace,
+    )  # fmt: skip
+    if status == SEPARATED:
+        return status, max_distance, vx, vy, vz, ax, ay, az, simplex
+    if status == OVERLAPPING:
+        distance, nx, ny, nz, ax, ay, az = calc_core_penetration(
+            shapes,
+            shape_a,
+            scale_a,
+            r_a,
+            shape_b,
+            scale_b,
+            r_b,
+            px,
+            py,
+            pz,
+            hx,
+            hy,
+            hz,
+            MIN_COSINE_TO_HISTORY,
+        )
+        return status, distance, nx, ny, nz, ax, ay, az, simplex
+    distance = math.sqrt(vx * vx + vy * vy + vz * vz)
+    return status, distance, vx / distance, vy / distance, vz / distance, ax, ay, az, simplex
+
+
+@kernel
 def _look_up_pairs(
     pair_a: Array,
     pair_b: Array,
     n_pairs: int,
     memory: Memory,
     table: Array,
-    axis_keys: Array,
-    axes: Array,
+    axis_cache: AxisCache,
     remembered: Array,
     known_axes: Array,
 ) -> None:
@@ -302,9 +363,9 @@ def _look_up_pairs(
     for pair in range(n_pairs):
         key = pair_a[pair] * KEY_STEP + pair_b[pair]
         remembered[pair] = find_in_memory(key, memory, table)
-        place, known = find_axis(key, axis_keys)
+        place, known = find_axis(key, axis_cache)
         for d in range(3):
-            known_axes[pair, d] = axes[place, d] if known else 0.0
+            known_axes[pair, d] = axis_cache.axes[place, d] if known else 0.0
 
 
 @kernel
@@ -330,8 +391,7 @@ def find_contacts(
     foreseen: Array,
     memory: Memory,
     table: Array,
-    axis_keys: Array,
-    axes: Array,
+    axis_cache: AxisCache,
     remembered: Array,
     known_axes: Array,
     rows: ContactRows,
@@ -358,7 +418,7 @@ def find_contacts(
         slow_speed: pairs of rocks that are not SEARCHED, slower than this against each other, follow [m/s].
         foreseen: per body, by how much its pairs may be faster than before the step, see `foresight` [m/s].
         memory, table: loaded points of the last step, see `contacts`.
-        axis_keys, axes: cache of separating axes: skips pairs, never changes a result.
+        axis_cache: skips pairs, never changes a result.
         remembered, known_axes: (n_pairs,) integers and (n_pairs, 3) at least: scratch.
         rows: set from `n_rows` on.
         n_rows: number of rows before.
@@ -372,7 +432,7 @@ def find_contacts(
     shape, scale, positions, rotations = bodies.shape, bodies.scale, bodies.positions, bodies.rotations
     points = all_points[:max_points]
     statistics[:] = 0
-    _look_up_pairs(pair_a, pair_b, n_pairs, memory, table, axis_keys, axes, remembered, known_axes)
+    _look_up_pairs(pair_a, pair_b, n_pairs, memory, table, axis_cache, remembered, known_axes)
     for pair in range(n_pairs):
         a, b = pair_a[pair], pair_b[pair]
         key = a * KEY_STEP + b
@@ -462,24 +522,16 @@ def find_contacts(
             statistics[1] += 1
             if first_row >= 0:
                 simplex = read_simplex(memory, first_row)
-            status, vx, vy, vz, ax, ay, az, simplex = calc_core_distance(
-                shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, gx, gy, gz, simplex,
+            status, distance, nx, ny, nz, ax, ay, az, simplex = calc_signed_core_distance(
+                shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, gx, gy, gz, hx, hy, hz, simplex,
                 roundings + max_gap, gjk_workspace,
             )  # fmt: skip
             if status == SEPARATED:
-                place, _ = find_axis(key, axis_keys)
-                axis_keys[place] = key
-                axes[place, 0], axes[place, 1], axes[place, 2] = vx, vy, vz
+                place, _ = find_axis(key, axis_cache)
+                axis_cache.keys[place] = key
+                axis_cache.axes[place, 0], axis_cache.axes[place, 1], axis_cache.axes[place, 2] = nx, ny, nz
                 continue
-            if status == OVERLAPPING:
-                statistics[2] += 1
-                distance, nx, ny, nz, ax, ay, az = calc_core_penetration(
-                    shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, hx, hy, hz,
-                    MIN_COSINE_TO_HISTORY,
-                )  # fmt: skip
-            else:
-                distance = math.sqrt(vx * vx + vy * vy + vz * vz)
-                nx, ny, nz = vx / distance, vy / distance, vz / distance
+            statistics[2] += status == OVERLAPPING
             gap = distance - roundings
             shift = scale_a * shapes.rounding[shape_a] + 0.5 * gap
             points[0, 0], points[0, 1], points[0, 2] = ax + shift * nx, ay + shift * ny, az + shift * nz
