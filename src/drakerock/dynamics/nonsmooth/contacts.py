@@ -92,6 +92,9 @@ def make_memory(n: int) -> Memory:
 class AxisCache(NamedTuple):
     """The separating axes of pairs that are near but apart: places for p of them, found by their key.
 
+    A pair has a choice of two places, the later one beside the earlier: with a single place each, a tenth of the pairs
+    pushed each other out in every step.
+
     Attributes:
         keys: (p,) key of the pair at each place, or -1.
         axes: (p, 3) float32 its axis, any length.
@@ -104,7 +107,7 @@ class AxisCache(NamedTuple):
 def make_axis_cache(n: int) -> AxisCache:
     """Return an empty cache with room for at least so many pairs."""
     places = 1 << int(np.ceil(np.log2(n)))
-    # Key and axis of a place beside each other: they come with one line of the processor's cache.
+    # Two places, with key and axis each, are a line of the processor's cache.
     records = make_zeros((places, 8), np.float32)
     cache = AxisCache(records.view(np.int64)[:, 0], records[:, 2:5])
     cache.keys[:] = -1
@@ -209,8 +212,22 @@ def find_in_memory(key: int, memory: Memory, table: Array) -> int:
 @kernel
 def find_axis(key: int, cache: AxisCache) -> tuple[int, bool]:
     """Return the place of a pair in the cache of separating axes, and whether it is the pair's own."""
-    place = _hash(key, len(cache.keys) - 1)
+    place = 2 * _hash(key, len(cache.keys) // 2 - 1)
+    if cache.keys[place + 1] == key:
+        place += 1
     return place, cache.keys[place] == key
+
+
+@kernel
+def store_axis(key: int, x: float, y: float, z: float, cache: AxisCache) -> None:
+    """Write a pair's axis to the cache; of two other pairs in its places the earlier one goes."""
+    place, known = find_axis(key, cache)
+    if not known:
+        cache.keys[place + 1] = cache.keys[place]
+        for d in range(3):
+            cache.axes[place + 1, d] = cache.axes[place, d]
+    cache.keys[place] = key
+    cache.axes[place, 0], cache.axes[place, 1], cache.axes[place, 2] = x, y, z
 
 
 @kernel

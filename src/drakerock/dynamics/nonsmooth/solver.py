@@ -33,6 +33,7 @@ from drakerock.dynamics.nonsmooth.contacts import (
     TANGENT_MASS,
     TANGENT_STEP,
 )
+from drakerock.dynamics.nonsmooth.prefetching import AHEAD, prefetch
 
 # Columns of a body of the solve.
 ANGULAR = 0  # 0..2 angular velocity in W
@@ -193,6 +194,12 @@ def _relative_velocity_machine(row: Array, body_a: Array, spatial: Array) -> Vec
     )
 
 
+@kernel
+def _prefetch_bodies(body_a: Array, body_b: Array, row: int, bodies: Array, n_rocks: int) -> None:
+    prefetch(bodies, body_a[row])
+    prefetch(bodies, min(body_b[row], n_rocks))
+
+
 @allocating_kernel
 def prepare_rows(
     rows: Array,
@@ -230,6 +237,7 @@ def prepare_rows(
     for b in range(len(spatial)):
         _calc_body_velocity(machine, velocity, b, spatial[b])
     for k in range(n_rows):
+        _prefetch_bodies(body_a, body_b, min(k + AHEAD, n_rows - 1), bodies, n_rocks)
         row = rows[k]
         a, b = body_a[k], body_b[k]
         mobility[:] = 0.0

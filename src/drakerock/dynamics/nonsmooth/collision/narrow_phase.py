@@ -59,13 +59,14 @@ from drakerock.dynamics.nonsmooth.contacts import (
     read_impulse,
     read_key,
     read_simplex,
+    store_axis,
 )
+from drakerock.dynamics.nonsmooth.prefetching import AHEAD, prefetch
 
 # A pair that overlaps deeply may turn its normal from the direction it was pushed in by at most 60 degrees.
 MIN_COSINE_TO_HISTORY = 0.5
 # A way per step from which on all corners of a rock count against plates and other solid pieces [m].
 FAST = 0.03
-
 
 Workspace = tuple[GjkWorkspace, tuple[Array, Array, Array, Array], Array, Array]
 
@@ -261,6 +262,10 @@ def follow_contacts(
     """
     n_rows = 0
     for k in range(n_active):
+        ahead = active[min(k + AHEAD, n_active - 1)]
+        prefetch(bodies.rotations, int(memory.pairs[ahead, 0]))
+        prefetch(bodies.positions, int(memory.pairs[ahead, 0]))
+        prefetch(bodies.positions, int(memory.pairs[ahead, 1]))
         row = active[k]
         if calm[memory.pairs[row, 0]] == CALM and calm[memory.pairs[row, 1]] == CALM:
             n_rows = _follow_row(memory, row, bodies, restitution, rows, n_rows)
@@ -369,6 +374,22 @@ def _look_up_pairs(
 
 
 @kernel
+def _prefetch_pair(
+    pair_b: Array, remembered: Array, pair: int, bodies: CollisionBodies, velocities: Array, memory: Memory
+) -> None:
+    """Ask for what a pair needs; pairs of one first body are in line, so that it is at hand."""
+    b = pair_b[pair]
+    prefetch(bodies.positions, b)
+    prefetch(bodies.rotations, b)
+    prefetch(velocities, bodies.solver_body[b])
+    prefetch(bodies.shape, b)
+    prefetch(bodies.scale, b)
+    prefetch(bodies.friction, b)
+    if remembered[pair] >= 0:
+        prefetch(memory.values, remembered[pair])
+
+
+@kernel
 def find_contacts(
     pair_a: Array,
     pair_b: Array,
@@ -434,6 +455,7 @@ def find_contacts(
     statistics[:] = 0
     _look_up_pairs(pair_a, pair_b, n_pairs, memory, table, axis_cache, remembered, known_axes)
     for pair in range(n_pairs):
+        _prefetch_pair(pair_b, remembered, min(pair + AHEAD, n_pairs - 1), bodies, velocities, memory)
         a, b = pair_a[pair], pair_b[pair]
         key = a * KEY_STEP + b
         shape_a, scale_a = shape[a], scale[a]
@@ -527,9 +549,7 @@ def find_contacts(
                 roundings + max_gap, gjk_workspace,
             )  # fmt: skip
             if status == SEPARATED:
-                place, _ = find_axis(key, axis_cache)
-                axis_cache.keys[place] = key
-                axis_cache.axes[place, 0], axis_cache.axes[place, 1], axis_cache.axes[place, 2] = nx, ny, nz
+                store_axis(key, nx, ny, nz, axis_cache)
                 continue
             statistics[2] += status == OVERLAPPING
             gap = distance - roundings

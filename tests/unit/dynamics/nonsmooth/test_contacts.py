@@ -1,0 +1,55 @@
+"""The cache of separating axes."""
+
+import numpy as np
+
+from drakerock.dynamics.nonsmooth.contacts import find_axis, make_axis_cache, store_axis
+
+
+def _find_rivals(cache, n):
+    """Return `n` keys of pairs that share their two places."""
+    place, _ = find_axis(7, cache)
+    keys = [7]
+    key = 8
+    while len(keys) < n:
+        if find_axis(key, cache)[0] // 2 == place // 2:
+            keys.append(key)
+        key += 1
+    return keys
+
+
+def _get_axis(key, cache):
+    place, known = find_axis(key, cache)
+    return cache.axes[place].tolist() if known else None
+
+
+def test_an_empty_cache_knows_no_axis():
+    cache = make_axis_cache(1000)
+    assert len(cache.keys) == 1024
+    assert not any(find_axis(key, cache)[1] for key in range(5000))
+
+
+def test_two_pairs_share_their_places_and_a_third_takes_that_of_the_earlier():
+    cache = make_axis_cache(64)
+    first, second, third = _find_rivals(cache, 3)
+    store_axis(first, 1.0, 2.0, 3.0, cache)
+    store_axis(second, 4.0, 5.0, 6.0, cache)
+    assert _get_axis(first, cache) == [1.0, 2.0, 3.0]
+    assert _get_axis(second, cache) == [4.0, 5.0, 6.0]
+    store_axis(first, -1.0, 0.0, 0.5, cache)
+    assert _get_axis(first, cache) == [-1.0, 0.0, 0.5]
+    assert _get_axis(second, cache) == [4.0, 5.0, 6.0]
+    store_axis(third, 7.0, 8.0, 9.0, cache)
+    assert _get_axis(third, cache) == [7.0, 8.0, 9.0]
+    assert _get_axis(first, cache) is None
+    assert _get_axis(second, cache) == [4.0, 5.0, 6.0]
+
+
+def test_a_cache_with_room_for_all_keeps_most():
+    cache = make_axis_cache(4000)
+    rng = np.random.default_rng(1)
+    keys = rng.choice(1 << 40, 1000, replace=False)
+    for key in keys:
+        store_axis(key, float(key % 101), 1.0, 2.0, cache)
+    kept = [key for key in keys if find_axis(key, cache)[1]]
+    assert len(kept) > 950
+    assert all(_get_axis(key, cache) == [key % 101, 1.0, 2.0] for key in kept)
