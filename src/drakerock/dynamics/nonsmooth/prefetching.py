@@ -1,7 +1,7 @@
 """Asking for memory before it is needed.
 
 What a contact needs lies anywhere: its bodies' poses, their velocities, the pair's memory. A processor that finds out
-only when it gets there waits each time for the far end of its cache, and so spent a sixth of the narrow phase.
+only when it gets there waits each time for the far end of its cache, and so spent up to a seventh of the narrow phase.
 """
 
 from __future__ import annotations

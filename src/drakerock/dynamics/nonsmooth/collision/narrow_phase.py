@@ -377,7 +377,7 @@ def _look_up_pairs(
 def _prefetch_pair(
     pair_b: Array, remembered: Array, pair: int, bodies: CollisionBodies, velocities: Array, memory: Memory
 ) -> None:
-    """Ask for what a pair needs; pairs of one first body are in line, so that it is at hand."""
+    """Ask for what a pair needs of its second body; its first is at hand, as the pairs of a body are in line."""
     b = pair_b[pair]
     prefetch(bodies.positions, b)
     prefetch(bodies.rotations, b)
