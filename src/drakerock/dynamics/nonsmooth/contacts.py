@@ -106,7 +106,7 @@ class AxisCache(NamedTuple):
 
 def make_axis_cache(n: int) -> AxisCache:
     """Return an empty cache with room for at least so many pairs."""
-    places = 1 << int(np.ceil(np.log2(n)))
+    places = calc_places(max(n, 2))
     # Two places, with key and axis each, are a line of the processor's cache.
     records = make_zeros((places, 8), np.float32)
     cache = AxisCache(records.view(np.int64)[:, 0], records[:, 2:5])
@@ -118,6 +118,11 @@ def make_contact_rows(capacity: int) -> ContactRows:
     """Return room for so many rows."""
     numbers = [np.zeros(capacity, np.int64) for _ in range(3)]
     return ContactRows(np.zeros((capacity, ROW_WIDTH)), *numbers)
+
+
+def calc_places(n: int) -> int:
+    """Return how many places a hash table for `n` has: the next power of two."""
+    return 1 << int(np.ceil(np.log2(n)))
 
 
 @kernel

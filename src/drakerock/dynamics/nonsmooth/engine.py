@@ -269,7 +269,7 @@ class NonsmoothEngine:
         self._velocities = np.zeros((n + 1 + self.n_machine_bodies, 6))
         self._marks = np.zeros(n + 1 + self.n_machine_bodies, np.int64)
         self._active = np.zeros(self.capacity, np.int64)
-        self._table = np.zeros(1 << int(np.ceil(np.log2(2 * self.capacity))), np.int64)
+        self._table = np.zeros(contacts.calc_places(2 * self.capacity), np.int64)
         # Places for the pairs that are near but apart; what is pushed out is searched anew, no more.
         self._axis_cache = contacts.make_axis_cache(max(4 * n, 1024))
         self._statistics = np.zeros(4, np.int64)

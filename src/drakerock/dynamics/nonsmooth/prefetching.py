@@ -14,13 +14,13 @@ from numba.extending import intrinsic
 
 from drakerock.dynamics.nonsmooth.lanes import INTEGER
 
-# Pairs, rows or points that memory is asked for ahead of.
+# How many pairs, rows or points before its use memory is asked for.
 AHEAD = 4
 
 
 @intrinsic  # type: ignore[untyped-decorator]
 def prefetch(_context: Any, array: Any, row: Any) -> Any:
-    """Ask for ``array[row]``, its first and its last byte. Nothing is read: it cannot fail, whatever the row."""
+    """Ask for ``array[row]``, its first byte and, of more than a number, its last. Nothing is read: no row can fail."""
     return types.void(array, types.int64), _build_prefetch
 
 

@@ -329,21 +329,8 @@ def calc_signed_core_distance(
         return status, max_distance, vx, vy, vz, ax, ay, az, simplex
     if status == OVERLAPPING:
         distance, nx, ny, nz, ax, ay, az = calc_core_penetration(
-            shapes,
-            shape_a,
-            scale_a,
-            r_a,
-            shape_b,
-            scale_b,
-            r_b,
-            px,
-            py,
-            pz,
-            hx,
-            hy,
-            hz,
-            MIN_COSINE_TO_HISTORY,
-        )
+            shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz, hx, hy, hz, MIN_COSINE_TO_HISTORY
+        )  # fmt: skip
         return status, distance, nx, ny, nz, ax, ay, az, simplex
     distance = math.sqrt(vx * vx + vy * vy + vz * vz)
     return status, distance, vx / distance, vy / distance, vz / distance, ax, ay, az, simplex
