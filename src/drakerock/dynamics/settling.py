@@ -32,6 +32,7 @@ from drakerock.pile.emission import (
     place_rocks,
     sample_rocks,
 )
+from drakerock.pile.ordering import order_by_place
 from drakerock.pile.shapes import RockShape, load_rock_shapes
 from drakerock.pile.site import Site, make_confined_site, make_site
 from drakerock.pile.state import PileState, load_pile, make_empty_pile, save_pile
@@ -285,7 +286,7 @@ def drop_rocks(
         progress: called as things proceed.
 
     Returns:
-        The pile at rest, the emitted rocks last, in the order in which they found room; and those that still wait.
+        The pile at rest, its rocks numbered by place (`order_by_place`); and those that still wait.
 
     Raises:
         SimulationFailure: the dynamics failed, or the pile did not come to rest in time.
@@ -312,6 +313,7 @@ def drop_rocks(
         raise SimulationFailure(f"the pile did not come to rest within {recipe.pile.max_time:g} s")
     if pile.contacts is not None:
         pile = _balance(pile, shapes, recipe, site, until_balanced, until_still)
+    pile = pile.select(order_by_place(pile.p_WRs))
     return replace(pile, V_WRs=np.zeros_like(pile.V_WRs)), waiting
 
 

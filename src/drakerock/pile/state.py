@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from drakerock.npz import load_arrays, save_arrays
 
@@ -38,27 +39,39 @@ class ContactMemory:
         for name in ("points", "impulses"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), np.float32))
 
-    def select(self, rocks: NDArray[np.int64], n: int) -> ContactMemory:
+    def select(self, rocks: NDArray[np.int64], p_WRs: Array, q_WRs: Array) -> ContactMemory:
         """Return the contacts among the chosen rocks (indices into n rocks), renumbered.
 
-        Pairs whose rocks change order are left out, since points belong to the first rock's frame. A rock that
-        loses a contact so no longer rests: what held it may be gone.
+        Where a pair's rocks change order, its points go to the other's frame. A rock that loses a contact no longer
+        rests: what held it may be gone.
+
+        Args:
+            rocks: (m,) in their new order.
+            p_WRs, q_WRs: (n, 3) and (n, 4) poses of all rocks, see `PileState`.
         """
-        number = np.full(n, -1, np.int64)
+        number = np.full(len(p_WRs), -1, np.int64)
         number[rocks] = np.arange(len(rocks))
         first, second = self.pairs.T if len(self.pairs) else np.zeros((2, 0), np.int64)
         new_first = number[first]
         new_second = np.where(second < 0, second, number[np.maximum(second, 0)])
-        kept = (new_first >= 0) & ((second < 0) | (new_second > new_first))
+        kept = (new_first >= 0) & ((second < 0) | (new_second >= 0))
         resting = self.resting.copy()
         resting[first[~kept]] = False
         resting[second[~kept & (second >= 0)]] = False
-        return ContactMemory(
-            np.column_stack([new_first, new_second])[kept],
-            self.points[kept],
-            self.impulses[kept],
-            resting[rocks],
-        )
+        points, impulses = self.points.copy(), self.impulses.copy()
+        pairs = np.column_stack([new_first, new_second])
+        swapped = np.flatnonzero(kept & (second >= 0) & (new_second < new_first))
+        if len(swapped):
+            old, new = first[swapped], second[swapped]
+            R_WOs, R_WNs = (Rotation.from_quat(q_WRs[side], scalar_first=True) for side in (old, new))
+            p_WCs = p_WRs[old] + R_WOs.apply(points[swapped])
+            points[swapped] = R_WNs.inv().apply(p_WCs - p_WRs[new])
+            impulses[swapped] = -impulses[swapped]
+            pairs[swapped] = pairs[swapped, ::-1]
+        rows = np.flatnonzero(kept)
+        if (np.diff(rocks) < 0).any():
+            rows = rows[np.lexsort((pairs[rows, 1], pairs[rows, 0]))]
+        return ContactMemory(pairs[rows], points[rows], impulses[rows], resting[rocks])
 
     def join(self, other: ContactMemory) -> ContactMemory:
         """Return the contacts of both piles, the other's rocks numbered after this one's."""
@@ -130,11 +143,11 @@ class PileState:
         return len(self.size)
 
     def select(self, rocks: NDArray[Any]) -> PileState:
-        """Return the pile of the rocks chosen by an index or mask array (n,)."""
+        """Return the pile of the rocks chosen by a mask (n,) or by indices, in their order."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rocks] for name in _ARRAYS}
         contacts = None
         if self.contacts is not None:
-            contacts = self.contacts.select(np.arange(len(self))[rocks], len(self))
+            contacts = self.contacts.select(np.arange(len(self))[rocks], self.p_WRs, self.q_WRs)
         return replace(self, **arrays, contacts=contacts)
 
     def join(self, other: PileState) -> PileState:

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drakerock.errors import InputError
 from drakerock.pile.state import ContactMemory, PileState, load_pile, save_pile
@@ -111,3 +112,30 @@ def test_contacts_of_unknown_rocks_are_refused(heap):
         replace(heap, contacts=replace(contacts, pairs=contacts.pairs + 9))
     with pytest.raises(ValueError, match="impulses"):
         replace(heap, contacts=replace(contacts, impulses=np.full((5, 3), np.nan)))
+
+
+def test_contacts_of_a_reordered_pile_press_the_same_points(heap):
+    pile = replace(heap, contacts=make_contacts())
+    order = np.random.default_rng(1).permutation(len(heap))
+    turned = pile.select(order)
+    back = turned.select(np.argsort(order))
+    assert np.array_equal(back.p_WRs, pile.p_WRs)
+
+    def find_pressed(pile):
+        """Return where each contact presses, on which rocks, and by how much: the larger of a pair's numbers first."""
+        first, second = pile.contacts.pairs.T
+        R_WRs = Rotation.from_quat(pile.q_WRs[first], scalar_first=True)
+        return first, second, pile.p_WRs[first] + R_WRs.apply(pile.contacts.points), pile.contacts.impulses
+
+    first, second, places, impulses = find_pressed(turned)
+    assert ((second < 0) | (first < second)).all()
+    assert (np.diff(first) >= 0).all()
+    old = {(a, b): (p, i) for a, b, p, i in zip(*find_pressed(pile), strict=True)}
+    for a, b, place, impulse in zip(first, second, places, impulses, strict=True):
+        one, two = order[a], order[b] if b >= 0 else b
+        sign = 1.0 if (one, two) in old else -1.0
+        place_before, impulse_before = old[(one, two) if sign > 0.0 else (two, one)]
+        assert place == pytest.approx(place_before, abs=1e-6)
+        assert np.array_equal(impulse, sign * impulse_before)
+    assert (second >= 0).sum() == 3
+    assert np.array_equal(turned.contacts.resting, pile.contacts.resting[order])
