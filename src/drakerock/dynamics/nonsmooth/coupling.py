@@ -25,10 +25,13 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 from pydrake.systems.framework import Context, LeafSystem, ValueProducer
 
-from drakerock.dynamics.nonsmooth import solver
-from drakerock.dynamics.nonsmooth.collision.geometry import make_tangents
 from drakerock.dynamics.nonsmooth.engine import MachinePiece, MachineStep, make_machineless_step
-from drakerock.dynamics.nonsmooth.solver import MachineArrays
+from drakerock.dynamics.nonsmooth.machine_step import (
+    JOINT_WIDTH,
+    SITE_WIDTH,
+    calc_free_motion,
+    make_machine_arrays,
+)
 from drakerock.machine.geometry import collision_pieces
 from drakerock.machine.model import Machine
 
@@ -36,8 +39,6 @@ Array = NDArray[np.float64]
 
 # Within this angle of its stop a joint has a row for it [rad, m].
 STOP_MARGIN = 0.05
-# Of the linkage's closed loops, as a share of the mobility they take away.
-LOOP_COMPLIANCE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,20 +137,19 @@ class MachineView(LeafSystem):
         scratch = self._scratch.Eval(context)
         plant.SetPositionsAndVelocities(scratch, self._state.Eval(context))
         v = plant.GetVelocities(scratch)
-        n_v = len(v)
-
-        inertia = plant.CalcMassMatrix(scratch) + h * np.diag(self._damping)
         forces = MultibodyForces(plant)
         plant.CalcForceElementsContribution(scratch, forces)
         # Gravity, springs and joint damping at the velocities of now.
         generalised = forces.generalized_forces() - plant.CalcBiasTerm(scratch)
-        spatial = plant.CalcGravityGeneralizedForces(scratch)
-        inverse = np.linalg.inv(inertia)
-        free_change = h * inverse @ (generalised + spatial)
-        world = plant.world_frame()
-        if self._loop_points:
-            inverse, free_change = self._close_loops(scratch, inverse, free_change, v)
+        generalised += plant.CalcGravityGeneralizedForces(scratch)
+        inverse, free_change = calc_free_motion(
+            np.ascontiguousarray(plant.CalcMassMatrix(scratch) + h * np.diag(self._damping)),
+            h * generalised,
+            v,
+            self._calc_loop_rows(scratch, len(v)),
+        )
 
+        world = plant.world_frame()
         jacobian = np.array(
             [
                 plant.CalcJacobianSpatialVelocity(
@@ -158,101 +158,63 @@ class MachineView(LeafSystem):
                 for body in self._bodies
             ]
         )
-        response = np.ascontiguousarray(inverse @ jacobian.transpose(0, 2, 1))
         X_WBs = np.array([plant.EvalBodyPoseInWorld(scratch, body).GetAsMatrix4() for body in self._bodies])
-
-        rows, values = self._make_motor_rows(self._desired.Eval(context), plant.GetPositions(scratch), n_v, h)
-        self._add_stop_rows(plant.GetPositions(scratch), n_v, h, rows, values)
-        self._add_site_rows(self._query.Eval(context), X_WBs, jacobian, h, rows, values)
-        row_array = np.array(rows).reshape(-1, n_v)
-        row_response = np.ascontiguousarray(row_array @ inverse)
-        row_values = np.zeros((len(rows), solver.MACHINE_ROW_WIDTH))
-        if rows:
-            row_values[
-                :, [solver.TARGET, solver.ROW_COMPLIANCE, solver.LOWER, solver.UPPER, solver.NORMAL_ROW]
-            ] = values
-            diagonal = np.einsum("rv,rv->r", row_array, row_response)
-            row_values[:, solver.ROW_MASS] = 1.0 / (diagonal + row_values[:, solver.ROW_COMPLIANCE])
+        positions = plant.GetPositions(scratch)
+        joints = self._find_motor_laws(self._desired.Eval(context), positions, h)
+        joints += self._find_stop_laws(positions, h)
+        contacts = self._find_site_contacts(self._query.Eval(context))
+        arrays = make_machine_arrays(
+            inverse,
+            jacobian,
+            X_WBs[:, :3, 3].copy(),
+            np.array(joints, float).reshape(-1, JOINT_WIDTH),
+            np.array(contacts, float).reshape(-1, SITE_WIDTH),
+            self._stiction_tolerance,
+            h,
+        )
         X_WB = X_WBs[layout.bucket]
         sensor = np.concatenate([X_WB[:3, :3].reshape(-1), X_WB[:3, 3], layout.sensor[0], layout.sensor[1]])
-        output.set_value(
-            MachineStep(
-                X_WBs,
-                v,
-                free_change,
-                MachineArrays(
-                    np.ascontiguousarray(jacobian),
-                    response,
-                    np.ascontiguousarray(jacobian @ response),
-                    row_array,
-                    row_response,
-                    row_values,
-                ),
-                sensor[None, :],
-            )
-        )
+        output.set_value(MachineStep(X_WBs, v, free_change, arrays, sensor[None, :]))
 
-    def _close_loops(
-        self, scratch: Context, inverse: Array, free_change: Array, v: Array
-    ) -> tuple[Array, Array]:
-        """Return inverse inertia and free change of velocity with the linkage's loops held closed."""
+    def _calc_loop_rows(self, scratch: Context, n_v: int) -> Array:
+        """Return what the velocities (v,) must not change: the distance of the two points of each loop, (3 l, v)."""
         plant = self._plant
         world = plant.world_frame()
-        points = [
-            plant.CalcJacobianTranslationalVelocity(scratch, JacobianWrtVariable.kV, frame, p, world, world)
-            for frame, p in self._loop_points
-        ]
-        rows = np.vstack(points[0::2]) - np.vstack(points[1::2])
-        response = inverse @ rows.T
-        # A plane linkage has rows that say nothing: with a little compliance they have a solution, too.
-        mobility = rows @ response
-        mobility += LOOP_COMPLIANCE * np.trace(mobility) * np.eye(len(rows))
-        hold = np.linalg.solve(mobility, response.T).T
-        return inverse - hold @ response.T, free_change - hold @ (rows @ (v + free_change))
+        points = np.array(
+            [
+                plant.CalcJacobianTranslationalVelocity(
+                    scratch, JacobianWrtVariable.kV, frame, p, world, world
+                )
+                for frame, p in self._loop_points
+            ]
+        ).reshape(-1, 2, 3, n_v)
+        return (points[:, 0] - points[:, 1]).reshape(-1, n_v)
 
-    def _make_motor_rows(
-        self, desired: Array, positions: Array, n_v: int, h: float
-    ) -> tuple[list[Array], list[list[float]]]:
-        rows, values = [], []
-        n = len(self._motors)
+    def _find_motor_laws(self, desired: Array, positions: Array, h: float) -> list[list[float]]:
+        """Return a law per motor, see `machine_step`."""
+        laws, n = [], len(self._motors)
         for k, motor in enumerate(self._motors):
-            row = np.zeros(n_v)
-            row[motor.velocity_start] = 1.0
             gain = motor.d + h * motor.p
-            target = (
-                motor.d * desired[n + k] + motor.p * (desired[k] - positions[motor.position_start])
-            ) / gain
-            rows.append(row)
-            values.append([target, 1.0 / (h * gain), -h * motor.effort, h * motor.effort, -1])
-        return rows, values
+            lag = desired[k] - positions[motor.position_start]
+            target = (motor.d * desired[n + k] + motor.p * lag) / gain
+            laws.append(
+                [motor.velocity_start, 1.0, target, 1.0 / (h * gain), -h * motor.effort, h * motor.effort]
+            )
+        return laws
 
-    def _add_stop_rows(
-        self, positions: Array, n_v: int, h: float, rows: list[Array], values: list[list[float]]
-    ) -> None:
+    def _find_stop_laws(self, positions: Array, h: float) -> list[list[float]]:
+        """Return a law per joint stop that is near, see `machine_step`."""
+        laws = []
         for stop in self._stops:
-            position = positions[stop.position_start]
-            for side, limit in ((1.0, stop.lower), (-1.0, stop.upper)):
-                distance = side * (position - limit)
-                if distance < STOP_MARGIN:
-                    row = np.zeros(n_v)
-                    row[stop.velocity_start] = side
-                    rows.append(row)
-                    # It may reach the stop within the step, not pass it.
-                    values.append([-max(distance, 0.0) / h, 0.0, 0.0, np.inf, -1])
+            distance = stop.side * (positions[stop.position_start] - stop.limit)
+            if distance < STOP_MARGIN:
+                # It may reach the stop within the step, not pass it.
+                laws.append([stop.velocity_start, stop.side, -max(distance, 0.0) / h, 0.0, 0.0, np.inf])
+        return laws
 
-    def _add_site_rows(
-        self,
-        query: QueryObject,
-        X_WBs: Array,
-        jacobian: Array,
-        h: float,
-        rows: list[Array],
-        values: list[list[float]],
-    ) -> None:
-        """Add three rows per contact of a machine body with the site: tyres on the floor, above all."""
-        numbers: list[int] = []
-        axes: list[list[float]] = []
-        arms: list[Array] = []
+    def _find_site_contacts(self, query: QueryObject) -> list[list[float]]:
+        """Return the contacts of machine bodies with the site, tyres on the floor above all; see `machine_step`."""
+        contacts = []
         for pair in query.ComputePointPairPenetration():
             body_A, stiffness_A, mu_A = self._find_material(query, pair.id_A)
             body_B, stiffness_B, mu_B = self._find_material(query, pair.id_B)
@@ -261,24 +223,18 @@ class MachineView(LeafSystem):
             # nhat_BA_W points out of B into A
             number, sign = (body_A, 1.0) if body_A is not None else (body_B, -1.0)
             assert number is not None
-            stiffness = stiffness_A * stiffness_B / (stiffness_A + stiffness_B)
-            mu = 2.0 * mu_A * mu_B / (mu_A + mu_B)
-            normal = [sign * part for part in pair.nhat_BA_W]
-            numbers.append(number)
-            axes.append([*normal, *make_tangents(*normal)])
-            arms.append(0.5 * (pair.p_WCa + pair.p_WCb) - X_WBs[number, :3, 3])
-            first = len(values)
-            load = h * stiffness * pair.depth
-            # Drake's regularised friction is full at the stiction tolerance.
-            friction = [0.0, self._stiction_tolerance / (mu * load), -mu, mu, first]
-            values.append([pair.depth / h, 1.0 / (h * h * stiffness), 0.0, np.inf, -1])
-            values.extend([friction, friction])
-        if numbers:
-            directions = np.array(axes).reshape(-1, 3, 3)
-            # A direction's velocity at an arm: along it, and about the arm.
-            turning = np.cross(np.array(arms)[:, None], directions)
-            spatial = np.concatenate([turning, directions], axis=2)
-            rows.extend((spatial @ jacobian[numbers]).reshape(-1, jacobian.shape[2]))
+            sides = zip(pair.p_WCa.tolist(), pair.p_WCb.tolist(), strict=True)
+            contacts.append(
+                [
+                    number,
+                    *(sign * part for part in pair.nhat_BA_W.tolist()),
+                    *(0.5 * (a + b) for a, b in sides),
+                    pair.depth,
+                    stiffness_A * stiffness_B / (stiffness_A + stiffness_B),
+                    2.0 * mu_A * mu_B / (mu_A + mu_B),
+                ]
+            )
+        return contacts
 
     def _find_material(self, query: QueryObject, geometry: object) -> tuple[int | None, float, float]:
         """Return a geometry's body number (None: not the machine's), point stiffness [N/m] and friction."""
@@ -306,10 +262,12 @@ class _Motor:
 
 @dataclass(frozen=True)
 class _Stop:
+    """A joint's lower (side 1) or upper stop (-1)."""
+
     position_start: int
     velocity_start: int
-    lower: float
-    upper: float
+    side: float
+    limit: float
 
 
 def _find_motors(plant: MultibodyPlant, machine: Machine) -> Sequence[_Motor]:
@@ -324,22 +282,14 @@ def _find_motors(plant: MultibodyPlant, machine: Machine) -> Sequence[_Motor]:
 
 
 def _find_stops(plant: MultibodyPlant, machine: Machine) -> Sequence[_Stop]:
-    stops = []
-    for index in plant.GetJointIndices(machine.instance):
-        joint = plant.get_joint(index)
-        if joint.num_velocities() == 1 and (
-            np.isfinite(joint.position_lower_limits()).any()
-            or np.isfinite(joint.position_upper_limits()).any()
-        ):
-            stops.append(
-                _Stop(
-                    joint.position_start(),
-                    joint.velocity_start(),
-                    float(joint.position_lower_limits()[0]),
-                    float(joint.position_upper_limits()[0]),
-                )
-            )
-    return stops
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices(machine.instance)]
+    return [
+        _Stop(joint.position_start(), joint.velocity_start(), side, float(limits[0]))
+        for joint in joints
+        if joint.num_velocities() == 1
+        for side, limits in ((1.0, joint.position_lower_limits()), (-1.0, joint.position_upper_limits()))
+        if np.isfinite(limits[0])
+    ]
 
 
 def _find_damping(plant: MultibodyPlant) -> Array:
