@@ -320,6 +320,26 @@ def write_memory(
 
 
 @kernel
+def find_deepest(rows: ContactRows, n_rows: int) -> float:
+    """Return the deepest overlap of all points, 0 if there is none [m]."""
+    deepest = 0.0
+    for k in range(n_rows):
+        deepest = max(deepest, -rows.values[k, GAP])
+    return deepest
+
+
+@kernel
+def find_depths(rows: ContactRows, n_rows: int, depths: Array) -> int:
+    """Set `depths` to the overlaps of the points that carry load [m]; return how many there are."""
+    n_loaded = 0
+    for k in range(n_rows):
+        if rows.values[k, IMPULSE] > 0.0:
+            depths[n_loaded] = -rows.values[k, GAP]
+            n_loaded += 1
+    return n_loaded
+
+
+@kernel
 def _calc_approach(velocity: Array, row: Array, arm: int) -> float:
     """Return how fast the point at an arm of a row goes along its normal with a rock's velocity (6,) [m/s]."""
     x, y, z = row[arm], row[arm + 1], row[arm + 2]

@@ -300,6 +300,7 @@ class NonsmoothEngine:
     def _allocate_rows(self, capacity: int) -> None:
         self._rows = contacts.make_contact_rows(capacity)
         self._impacts = np.zeros((capacity, 3))
+        self._depths = np.zeros(capacity)
         self._batches = make_batch_arrays(capacity)
 
     # ---- state in and out
@@ -529,7 +530,7 @@ class NonsmoothEngine:
         places, n_active = contacts.index_memory(memory, n, status, self._active, self._table)
         n_rows = self._find_contacts(n_pairs, memory, self._table[:places], n_active)
         rows, body_a, body_b, *_ = self._rows
-        if -rows[:n_rows, contacts.GAP].min(initial=0.0) > DEEP_SHARE * config.max_penetration:
+        if contacts.find_deepest(self._rows, n_rows) > DEEP_SHARE * config.max_penetration:
             iterations *= RETRY_FACTOR
         if not warm:
             rows[:n_rows, contacts.IMPULSE : contacts.IMPULSE + 3] = 0.0
@@ -537,13 +538,12 @@ class NonsmoothEngine:
         velocity = machine.velocity.copy()
         machine.arrays.row_values[:, solver.ROW_IMPULSE] = 0.0
         upsilon = 1.0 / (1.0 + 4.0 * config.damping_time)
-        solver.prepare_rows(
+        n_impacts = solver.prepare_rows(
             rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, self.curvature, self.hertz,
             config.linear_overlap, dt, upsilon, config.max_recovery_speed, config.impact_threshold,
         )  # fmt: skip
-        n_impacts = 0
-        if self.restitution.any():
-            n_impacts = solver.solve_impacts(
+        if n_impacts > 0:
+            solver.solve_impacts(
                 rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, dt,
                 config.impact_threshold, config.impact_iterations, self._marks, self._impacts,
             )  # fmt: skip
@@ -559,7 +559,7 @@ class NonsmoothEngine:
 
         sane = motion.move(
             awake, self._bodies, self.inverse_inertia_local, dt, arrays.quaternions, arrays.positions,
-            new.quaternions, new.positions, new.velocities,
+            new.quaternions, new.positions, new.velocities, self._velocities,
         )  # fmt: skip
         if not sane or not np.isfinite(velocity).all():
             # The rows of bodies that are not awake have to stay zero.
@@ -567,7 +567,6 @@ class NonsmoothEngine:
             self._bodies_32[:] = 0.0
             self._velocities[:] = 0.0
             return None, None
-        self._velocities[awake] = new.velocities[awake]
         n_memory, n_idle = contacts.write_memory(
             n, status, memory, self._active, n_active, self._rows, n_rows,
             self._collision_bodies.rotations, self._velocities, dt,
@@ -590,8 +589,8 @@ class NonsmoothEngine:
             config.rest.displacement, config.rest.time, config.rest.speed, self._lower_site, self._upper_site,
             config.reduction == "rest",
         )  # fmt: skip
-        loaded = rows[:n_rows, contacts.IMPULSE] > 0.0
-        depths = -rows[:n_rows, contacts.GAP][loaded]
+        n_loaded = contacts.find_depths(self._rows, n_rows, self._depths)
+        depths = self._depths[:n_loaded]
         max_penetration = float(depths.max(initial=0.0))
         report = StepReport(
             F_Bs_W=solver.sum_machine_impulses(
@@ -601,7 +600,7 @@ class NonsmoothEngine:
             machine_velocity=velocity,
             awake=awake,
             n_contacts=n_rows,
-            n_loaded=int(loaded.sum()),
+            n_loaded=n_loaded,
             n_sweeps=iterations,
             residual=residual,
             max_penetration=max_penetration,
@@ -634,9 +633,10 @@ class NonsmoothEngine:
             self.inverse_inertia_local, self._inverse_inertia,
         )  # fmt: skip
         # Boxes of others are kept from step to step.
-        driven = np.flatnonzero((self._foreseen[:n] > 0.0) & (status == AWAKE))
-        self._lower[driven] -= dt * self._foreseen[driven, None]
-        self._upper[driven] += dt * self._foreseen[driven, None]
+        if self._foreseen.any():
+            driven = np.flatnonzero((self._foreseen[:n] > 0.0) & (status == AWAKE))
+            self._lower[driven] -= dt * self._foreseen[driven, None]
+            self._upper[driven] += dt * self._foreseen[driven, None]
         broad_phase.calc_piece_boxes(
             self.first_piece, self.piece_body, bodies.shape, self.convex, machine.X_WBs,
             self._velocities[n + 1 :], dt, margin, bodies.positions, bodies.rotations, self._lower, self._upper,

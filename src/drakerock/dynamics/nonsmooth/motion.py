@@ -113,6 +113,7 @@ def move(
     new_quaternions: Array,
     new_positions: Array,
     new_velocities: Array,
+    body_velocities: Array,
 ) -> bool:
     """Set the awake rocks' poses after the step, and their velocities.
 
@@ -126,6 +127,7 @@ def move(
         time_step: [s].
         quaternions, positions: (n, 4), (n, 3) before the step.
         new_quaternions, new_positions, new_velocities: (n, 4), (n, 3), (n, 6) set for the awake rocks.
+        body_velocities: (n, 6) set to the new velocities for them, too.
 
     Returns:
         False if any of it is not finite.
@@ -161,6 +163,8 @@ def move(
         total = qw + qx + qy + qz
         for d in range(3):
             total += new_positions[i, d] + new_velocities[i, d] + new_velocities[i, 3 + d]
+        for d in range(6):
+            body_velocities[i, d] = new_velocities[i, d]
         bodies[i] = 0.0
         # Not math.isfinite: with sums reordered it is compiled to True.
         if not abs(total) < HUGE:

@@ -217,7 +217,7 @@ def prepare_rows(
     upsilon: float,
     max_recovery_speed: float,
     impact_threshold: float,
-) -> None:
+) -> int:
     """Set the solver's columns of the contact rows.
 
     Args:
@@ -231,7 +231,11 @@ def prepare_rows(
         time_step: [s]; upsilon: 1 / (1 + 4 tau / dt).
         max_recovery_speed: at which overlaps are pushed apart at most [m/s].
         impact_threshold: what approaches faster is an impact [m/s].
+
+    Returns:
+        the number of impacts of pairs with restitution, for `solve_impacts`.
     """
+    n_impacts = 0
     mobility = np.zeros(6)
     spatial = np.zeros((len(machine.jacobian), 6))
     for b in range(len(spatial)):
@@ -258,7 +262,10 @@ def prepare_rows(
         m12 = _quadratic(mobility, tx, ty, tz, ux, uy, uz)
         m22 = _quadratic(mobility, ux, uy, uz, ux, uy, uz)
         gap = row[GAP]
+        approach = nx * dx + ny * dy + nz * dz
         compliance = 0.0
+        if row[RESTITUTION] > 0.0 and _is_impact(gap, approach, time_step, impact_threshold):
+            n_impacts += 1
         if gap > 0.0:
             # apart: they may approach until they touch at the end of the step
             bias = -gap / time_step
@@ -266,7 +273,6 @@ def prepare_rows(
             # A force that grows with this power of the overlap is, about it, a spring stretched by 1 / power of it.
             power = 1.0 if linear_overlap > 0.0 else 1.5
             bias = min(-4.0 * upsilon * (1.0 / power) * gap / time_step, max_recovery_speed)
-            approach = nx * dx + ny * dy + nz * dz
             # An impact without restitution is rigid, and none of its speed is kept.
             if approach >= -impact_threshold:
                 overlap = linear_overlap if linear_overlap > 0.0 else max(-gap, MIN_OVERLAP)
@@ -291,6 +297,12 @@ def prepare_rows(
         if slip > limit:
             row[IMPULSE + 1] *= limit / slip
             row[IMPULSE + 2] *= limit / slip
+    return n_impacts
+
+
+@kernel
+def _is_impact(gap: float, approach: float, time_step: float, threshold: float) -> bool:
+    return bool(approach < -threshold and gap + time_step * approach < 0.0)
 
 
 @kernel
@@ -571,7 +583,7 @@ def solve_impacts(
     iterations: int,
     marks: Array,
     impact_impulses: Array,
-) -> int:
+) -> None:
     """The impact stage: Newton's law for pairs with restitution that meet faster than `threshold`.
 
     It covers all touching contacts of the bodies that take part. Pairs without restitution need no stage of
@@ -585,30 +597,22 @@ def solve_impacts(
         threshold: [m/s].
         iterations: number of sweeps.
         marks: (bodies of the solve,) scratch.
-        impact_impulses: (rows, 3) set if there are impacts: their impulses in W [N s].
-
-    Returns:
-        the number of impacts.
+        impact_impulses: (rows, 3) set: the impacts' impulses in W [N s].
     """
     spatial = np.zeros((len(machine.jacobian), 6))
     for b in range(len(spatial)):
         _calc_body_velocity(machine, velocity, b, spatial[b])
-    n_impacts = 0
+    marks[:] = 0
     for k in range(n_rows):
         row = rows[k]
         if row[RESTITUTION] <= 0.0:
             continue
         a, b = body_a[k], body_b[k]
         approach = _calc_approach(row, a, b, bodies, n_rocks, spatial)
-        if approach < -threshold and row[GAP] + time_step * approach < 0.0:
-            if n_impacts == 0:
-                marks[:] = 0
+        if _is_impact(row[GAP], approach, time_step, threshold):
             marks[a] = 1
             if b != n_rocks:
                 marks[b] = 1
-            n_impacts += 1
-    if n_impacts == 0:
-        return 0
     chosen = np.empty(n_rows, np.int64)
     saved = np.empty((n_rows, 6))
     n_chosen = 0
@@ -652,4 +656,3 @@ def solve_impacts(
         for d in range(3):
             row[IMPULSE + d] = saved[c, d]
         row[BIAS], row[COMPLIANCE], row[NORMAL_MASS] = saved[c, 3], saved[c, 4], saved[c, 5]
-    return n_impacts
