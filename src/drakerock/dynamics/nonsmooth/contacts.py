@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drakerock.dynamics.nonsmooth.compiling import Array, Vector, kernel
 from drakerock.dynamics.nonsmooth.lanes import make_zeros
+from drakerock.dynamics.nonsmooth.prefetching import prefetch
 
 # Columns of a contact row. All vectors in W; impulses act on body B, and reversed on body A.
 NORMAL = 0  # 0..2 unit normal from A to B
@@ -221,6 +222,19 @@ def find_axis(key: int, cache: AxisCache) -> tuple[int, bool]:
     if cache.keys[place + 1] == key:
         place += 1
     return place, cache.keys[place] == key
+
+
+@kernel
+def prefetch_places(key: int, table: Array, cache: AxisCache) -> None:
+    """Ask for the places where a pair will be looked up."""
+    prefetch(table, _hash(key, len(table) - 1))
+    prefetch(cache.keys, 2 * _hash(key, len(cache.keys) // 2 - 1))
+
+
+@kernel
+def prefetch_remembered(key: int, memory: Memory, table: Array) -> None:
+    """Ask for the row of the memory that is at a pair's place, if any; the place should be at hand by now."""
+    prefetch(memory.pairs, max(table[_hash(key, len(table) - 1)], 0))
 
 
 @kernel

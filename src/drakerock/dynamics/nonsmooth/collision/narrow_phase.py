@@ -56,6 +56,8 @@ from drakerock.dynamics.nonsmooth.contacts import (
     find_axis,
     find_in_memory,
     is_loaded,
+    prefetch_places,
+    prefetch_remembered,
     read_impulse,
     read_key,
     read_simplex,
@@ -65,6 +67,8 @@ from drakerock.dynamics.nonsmooth.prefetching import AHEAD, prefetch
 
 # A pair that overlaps deeply may turn its normal from the direction it was pushed in by at most 60 degrees.
 MIN_COSINE_TO_HISTORY = 0.5
+# How many pairs ahead what a look-up begins with is asked for, so that what it leads to can be, too.
+FAR_AHEAD = 3 * AHEAD
 # A way per step from which on all corners of a rock count against plates and other solid pieces [m].
 FAST = 0.03
 
@@ -353,6 +357,10 @@ def _look_up_pairs(
     fetches several at once.
     """
     for pair in range(n_pairs):
+        ahead = min(pair + FAR_AHEAD, n_pairs - 1)
+        prefetch_places(pair_a[ahead] * KEY_STEP + pair_b[ahead], table, axis_cache)
+        ahead = min(pair + AHEAD, n_pairs - 1)
+        prefetch_remembered(pair_a[ahead] * KEY_STEP + pair_b[ahead], memory, table)
         key = pair_a[pair] * KEY_STEP + pair_b[pair]
         remembered[pair] = find_in_memory(key, memory, table)
         place, known = find_axis(key, axis_cache)
