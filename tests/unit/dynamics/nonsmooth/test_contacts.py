@@ -1,8 +1,17 @@
-"""The cache of separating axes."""
+"""The cache of separating axes, and how deep contacts are."""
 
 import numpy as np
 
-from drakerock.dynamics.nonsmooth.contacts import find_axis, make_axis_cache, store_axis
+from drakerock.dynamics.nonsmooth.contacts import (
+    GAP,
+    IMPULSE,
+    find_axis,
+    find_deepest,
+    find_depths,
+    make_axis_cache,
+    make_contact_rows,
+    store_axis,
+)
 
 
 def _find_rivals(cache, n):
@@ -53,3 +62,14 @@ def test_a_cache_with_room_for_all_keeps_most():
     kept = [key for key in keys if find_axis(key, cache)[1]]
     assert len(kept) > 950
     assert all(_get_axis(key, cache) == [key % 101, 1.0, 2.0] for key in kept)
+
+
+def test_depths_are_of_loaded_points_only():
+    rows = make_contact_rows(6)
+    rows.values[:, GAP] = [-0.001, -0.004, 0.002, -0.003, 0.001, -0.009]
+    rows.values[:, IMPULSE] = [1.0, 0.0, 2.0, 3.0, 0.0, 5.0]
+    depths = np.full(6, np.nan)
+    assert find_depths(rows, 5, depths) == 3
+    assert depths[:3].tolist() == [0.001, -0.002, 0.003]
+    assert find_deepest(rows, 5) == 0.004
+    assert find_deepest(rows, 0) == 0.0
