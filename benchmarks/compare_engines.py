@@ -6,9 +6,11 @@ Each seed is one pile, filled and at rest in the nonsmooth engine, relaxed for a
 machine standing, then dug with the same motor targets. Finished runs are skipped. `--points 1`: the nonsmooth engine
 with one contact point per pair, as the plant engine's point contact has it. `--against hydroelastic`: the plant engine
 with pressure fields over faces instead of single points, five times as dear. `--set damping_time=2`: another setting of
-the nonsmooth engine; give it an `--out` of its own. `--set linear_overlap=0.001 damping_time=0.75` is the plant's
-contact law: the same linear stiffness, and a step as damped as implicit Euler's. `--repeats 3`: each pile is dug three
-times in the nonsmooth engine, with one more iteration each, and their mean taken: digs are chaotic, these are cheap.
+the nonsmooth engine; give it an `--out` of its own. `--set linear_overlap=0.001 damping_time=0.75
+stiffness_factor=0.73 --dissipation 0` is one contact law in both: a spring of the same linear stiffness, as damped as an
+implicit Euler step makes it (the plant's usual Hunt-Crossley dissipation has no counterpart in the other).
+`--repeats 3`: each pile is dug three times in the nonsmooth engine, with one more iteration each, and their mean taken:
+digs are chaotic, these are cheap.
 """
 
 from __future__ import annotations
@@ -41,7 +43,13 @@ RELAXING = 1.0
 
 
 def run(
-    pile: PileState, engine: str, site: SiteConfig, depth: float, duration: float, settings: dict[str, float]
+    pile: PileState,
+    engine: str,
+    site: SiteConfig,
+    depth: float,
+    duration: float,
+    dissipation: float,
+    settings: dict[str, float],
 ) -> dict[str, float]:
     nonsmooth = engine.startswith("nonsmooth")
     dynamics = DynamicsConfig(
@@ -51,7 +59,9 @@ def run(
             manifold_points=int(engine.removeprefix("nonsmooth-")) if nonsmooth else 4,
             **settings,
         ),
-        plant=PlantEngineConfig(contact_model="hydroelastic" if engine == "hydroelastic" else "point"),
+        plant=PlantEngineConfig(
+            contact_model="hydroelastic" if engine == "hydroelastic" else "point", dissipation=dissipation
+        ),
         time_step=TIME_STEP,
     )
     builder = DiagramBuilder()
@@ -119,9 +129,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rocks", type=int, default=300)
     parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--points", type=int, choices=range(1, 5), default=4)
     parser.add_argument("--duration", type=float, default=10.0)
     parser.add_argument("--against", choices=("plant", "hydroelastic"), default="plant")
+    parser.add_argument(
+        "--dissipation", type=float, default=PlantEngineConfig().dissipation, help="of the plant's"
+    )
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="of the nonsmooth engine")
     parser.add_argument("--repeats", type=int, default=1, help="digs of a pile in the nonsmooth engine")
     parser.add_argument("--out", type=Path, default=Path("build/engines.jsonl"))
@@ -134,7 +148,8 @@ def main() -> None:
     iterations = settings.pop("iterations", float(NonsmoothConfig().iterations))
     ours = f"nonsmooth-{arguments.points}"
     digs = [(arguments.against, 0)] + [(ours, repeat) for repeat in range(arguments.repeats)]
-    for seed in range(arguments.seeds):
+    seeds = range(arguments.first, arguments.first + arguments.seeds)
+    for seed in seeds:
         todo = [dig for dig in digs if (seed, *dig) not in results]
         if not todo:
             continue
@@ -143,7 +158,13 @@ def main() -> None:
         depth = np.random.default_rng(seed).uniform(0.6, 1.4)
         for engine, repeat in todo:
             result = run(
-                pile, engine, site, depth, arguments.duration, {**settings, "iterations": iterations + repeat}
+                pile,
+                engine,
+                site,
+                depth,
+                arguments.duration,
+                arguments.dissipation,
+                {**settings, "iterations": iterations + repeat},
             )
             results[seed, engine, repeat] = result
             entry = {"seed": seed, "engine": engine, "repeat": repeat, "rocks": len(pile), **result}
@@ -153,10 +174,7 @@ def main() -> None:
     for metric in (*METRICS, "cpu_s"):
         a, b = (
             np.array(
-                [
-                    np.mean([results[seed, *dig][metric] for dig in digs if dig[0] == engine])
-                    for seed in range(arguments.seeds)
-                ]
+                [np.mean([results[seed, *dig][metric] for dig in digs if dig[0] == engine]) for seed in seeds]
             )
             for engine in (ours, arguments.against)
         )
