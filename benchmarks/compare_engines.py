@@ -7,8 +7,8 @@ machine standing, then dug with the same motor targets. Finished runs are skippe
 with one contact point per pair, as the plant engine's point contact has it. `--against hydroelastic`: the plant engine
 with pressure fields over faces instead of single points, five times as dear. `--set damping_time=2`: another setting of
 the nonsmooth engine; give it an `--out` of its own. `--set linear_overlap=0.001 damping_time=0.75
-stiffness_factor=0.73 --dissipation 0` is one contact law in both: a spring of the same linear stiffness, as damped as an
-implicit Euler step makes it (the plant's usual Hunt-Crossley dissipation has no counterpart in the other).
+stiffness_factor=0.73 --dissipation 0` is one contact law in both: a spring of the same linear stiffness, as damped as
+an implicit Euler step makes it (the plant's usual Hunt-Crossley dissipation has no counterpart in the other).
 `--repeats 3`: each pile is dug three times in the nonsmooth engine, with one more iteration each, and their mean taken:
 digs are chaotic, these are cheap.
 """
