@@ -6,7 +6,7 @@ import numpy as np
 from hilbertcurve.hilbertcurve import HilbertCurve
 from numpy.typing import NDArray
 
-# Width of the curve's cells [m]; a few rocks have their centre in each.
+# Width of the curve's cells [m]; hardly ever do two rocks of the default pile have their centres in one.
 CELL = 0.3
 
 

@@ -122,7 +122,7 @@ def test_contacts_of_a_reordered_pile_press_the_same_points(heap):
     assert np.array_equal(back.p_WRs, pile.p_WRs)
 
     def find_pressed(pile):
-        """Return where each contact presses, on which rocks, and by how much: the larger of a pair's numbers first."""
+        """Return which rocks each contact is between, where it presses, and how much."""
         first, second = pile.contacts.pairs.T
         R_WRs = Rotation.from_quat(pile.q_WRs[first], scalar_first=True)
         return first, second, pile.p_WRs[first] + R_WRs.apply(pile.contacts.points), pile.contacts.impulses

@@ -132,9 +132,21 @@ def _hash(key: int, mask: int) -> int:
 
 
 @kernel
+def make_key(a: int, b: int) -> int:
+    """Return the key of a pair of bodies, see `KEY_STEP`."""
+    return a * KEY_STEP + b
+
+
+@kernel
+def split_key(key: int) -> tuple[int, int]:
+    """Return the two bodies of a pair's key."""
+    return key // KEY_STEP, key % KEY_STEP
+
+
+@kernel
 def read_key(memory: Memory, row: int) -> int:
     """Return the key of the pair that a row of the memory belongs to."""
-    return int(memory.pairs[row, 0]) * KEY_STEP + int(memory.pairs[row, 1])
+    return make_key(int(memory.pairs[row, 0]), int(memory.pairs[row, 1]))
 
 
 @kernel
@@ -216,9 +228,15 @@ def find_in_memory(key: int, memory: Memory, table: Array) -> int:
 
 
 @kernel
+def _find_axis_places(key: int, cache: AxisCache) -> int:
+    """Return the first of a pair's two places."""
+    return 2 * _hash(key, len(cache.keys) // 2 - 1)
+
+
+@kernel
 def find_axis(key: int, cache: AxisCache) -> tuple[int, bool]:
     """Return the place of a pair in the cache of separating axes, and whether it is the pair's own."""
-    place = 2 * _hash(key, len(cache.keys) // 2 - 1)
+    place = _find_axis_places(key, cache)
     if cache.keys[place + 1] == key:
         place += 1
     return place, cache.keys[place] == key
@@ -228,7 +246,7 @@ def find_axis(key: int, cache: AxisCache) -> tuple[int, bool]:
 def prefetch_places(key: int, table: Array, cache: AxisCache) -> None:
     """Ask for the places where a pair will be looked up."""
     prefetch(table, _hash(key, len(table) - 1))
-    prefetch(cache.keys, 2 * _hash(key, len(cache.keys) // 2 - 1))
+    prefetch(cache.keys, _find_axis_places(key, cache))
 
 
 @kernel
@@ -306,7 +324,7 @@ def write_memory(
             continue
         if n_new < capacity:
             values = new.values[n_new]
-            a, b = rows.key[k] // KEY_STEP, rows.key[k] % KEY_STEP
+            a, b = split_key(rows.key[k])
             new.pairs[n_new, 0], new.pairs[n_new, 1] = a, b
             approach = _calc_approach(velocities[a], row, ARM_A)
             if b < n_rocks:

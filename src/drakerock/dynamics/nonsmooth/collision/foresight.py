@@ -17,7 +17,7 @@ from drakerock.dynamics.nonsmooth.collision.narrow_phase import (
 )
 from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
 from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, Vector, kernel
-from drakerock.dynamics.nonsmooth.contacts import GAP, IMPULSE, KEY_STEP, NORMAL, ContactRows
+from drakerock.dynamics.nonsmooth.contacts import GAP, IMPULSE, NORMAL, ContactRows, split_key
 
 
 @kernel
@@ -101,7 +101,7 @@ def foresee_overlaps(
         first, key = row, rows.key[row]
         while row < n_rows and rows.key[row] == key:
             row += 1
-        a, b = key // KEY_STEP, key % KEY_STEP
+        a, b = split_key(key)
         is_plane = first_plane <= b < first_piece
         v, w = velocities[a], velocities[bodies.solver_body[b]]
         way2 = (w[3] - v[3]) ** 2 + (w[4] - v[4]) ** 2 + (w[5] - v[5]) ** 2

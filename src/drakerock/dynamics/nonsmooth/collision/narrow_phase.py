@@ -41,7 +41,6 @@ from drakerock.dynamics.nonsmooth.contacts import (
     FRICTION,
     GAP,
     IMPULSE,
-    KEY_STEP,
     MEMORY_GAP,
     MEMORY_NORMAL,
     MEMORY_POINT,
@@ -56,6 +55,7 @@ from drakerock.dynamics.nonsmooth.contacts import (
     find_axis,
     find_in_memory,
     is_loaded,
+    make_key,
     prefetch_places,
     prefetch_remembered,
     read_impulse,
@@ -198,7 +198,7 @@ def _write_row(
 ) -> None:
     """Set a contact row: bodies, normal, point from A's origin, gap, impulse in W, restitution, simplex."""
     rows.body_a[n_rows], rows.body_b[n_rows] = bodies.solver_body[a], bodies.solver_body[b]
-    rows.key[n_rows] = a * KEY_STEP + b
+    rows.key[n_rows] = make_key(a, b)
     nx, ny, nz = n
     x, y, z = point
     ix, iy, iz = impulse
@@ -358,10 +358,10 @@ def _look_up_pairs(
     """
     for pair in range(n_pairs):
         ahead = min(pair + FAR_AHEAD, n_pairs - 1)
-        prefetch_places(pair_a[ahead] * KEY_STEP + pair_b[ahead], table, axis_cache)
+        prefetch_places(make_key(pair_a[ahead], pair_b[ahead]), table, axis_cache)
         ahead = min(pair + AHEAD, n_pairs - 1)
-        prefetch_remembered(pair_a[ahead] * KEY_STEP + pair_b[ahead], memory, table)
-        key = pair_a[pair] * KEY_STEP + pair_b[pair]
+        prefetch_remembered(make_key(pair_a[ahead], pair_b[ahead]), memory, table)
+        key = make_key(pair_a[pair], pair_b[pair])
         remembered[pair] = find_in_memory(key, memory, table)
         place, known = find_axis(key, axis_cache)
         for d in range(3):
@@ -452,7 +452,7 @@ def find_contacts(
     for pair in range(n_pairs):
         _prefetch_pair(pair_b, remembered, min(pair + AHEAD, n_pairs - 1), bodies, velocities, memory)
         a, b = pair_a[pair], pair_b[pair]
-        key = a * KEY_STEP + b
+        key = make_key(a, b)
         shape_a, scale_a = shape[a], scale[a]
         r_a = get_rotation(rotations, a)
         body_1, body_2 = bodies.solver_body[a], bodies.solver_body[b]
