@@ -48,6 +48,8 @@ MEMORY_WIDTH = 12  # even: two numbers take the room of one of the context's
 
 # Points without load go into memory up to this share of its capacity, so that those with load find room.
 NEAR_SHARE = 0.875
+# Gaps in it are closed when they are one in this many of the points of rocks at rest.
+MAX_GAPS = 16
 
 # A pair's key is first * KEY_STEP + second; bodies are below it.
 KEY_STEP = 1 << 20
@@ -73,7 +75,8 @@ class Memory(NamedTuple):
     """The memory of m contact points. Pairs are apart from the rest: they are looked at in passes over all points.
 
     Attributes:
-        pairs: (m, 2) int32 the bodies of each; first a rock.
+        pairs: (m, 2) int32 the bodies of each; first a rock. -1 where there was a point of rocks at rest, see
+            `write_memory`.
         values: (m, MEMORY_WIDTH) float32.
     """
 
@@ -176,25 +179,34 @@ def is_loaded(memory: Memory, row: int) -> bool:
 
 
 @kernel
-def index_memory(memory: Memory, n_rocks: int, status: Array, active: Array, table: Array) -> tuple[int, int]:
+def _is_active(status: int) -> bool:
+    return status == 0 or status == 3
+
+
+@kernel
+def index_memory(
+    memory: Memory, n_rocks: int, status: Array, active: Array, table: Array
+) -> tuple[int, int, int]:
     """Set a hash table from a pair's key to the first of its rows in memory (rows of a pair are in line).
 
     Args:
         memory: of the last step (m points).
         n_rocks: number of rocks.
-        status: (n,) of each rock, see `broad_phase`. A pair without an awake rock is idle: it is not searched, its
-            points stay as they are, and it is left out.
-        active: (m,) at least, set: the rows that are not idle.
+        status: (n,) of each rock, see `broad_phase`. A pair of rocks at rest, or of one and what stands still, is idle:
+            it is not searched, its points stay as they are, and it is left out.
+        active: (m,) at least, set: the rows that are not idle, those of rocks that have left the site among them.
         table: (2**k,) at least twice as many places as rows; as many of the first as needed are set, -1 where
             empty.
 
     Returns:
-        how many places are in use: a power of two; look up in ``table[:places]``. And the number of active rows.
+        how many places are in use: a power of two; look up in ``table[:places]``. The number of active rows, and of gaps.
     """
-    n_active = 0
+    n_active, n_gaps = 0, 0
     for row in range(len(memory.pairs)):
         a, b = memory.pairs[row, 0], memory.pairs[row, 1]
-        if status[a] == 0 or (b < n_rocks and status[b] == 0):
+        if a < 0:
+            n_gaps += 1
+        elif _is_active(status[a]) or (b < n_rocks and _is_active(status[b])):
             active[n_active] = row
             n_active += 1
     places = 64
@@ -212,7 +224,7 @@ def index_memory(memory: Memory, n_rocks: int, status: Array, active: Array, tab
                 place = (place + 1) & mask
             table[place] = row
         last = key
-    return places, n_active
+    return places, n_active, n_gaps
 
 
 @kernel
@@ -270,10 +282,11 @@ def store_axis(key: int, x: float, y: float, z: float, cache: AxisCache) -> None
 @kernel
 def write_memory(
     n_rocks: int,
-    status: Array,
     old: Memory,
+    n_idle: int,
     active: Array,
     n_active: int,
+    n_gaps: int,
     rows: ContactRows,
     n_rows: int,
     rotations: Array,
@@ -281,34 +294,48 @@ def write_memory(
     time_step: float,
     near_gap: float,
     new: Memory,
-) -> tuple[int, int]:
+) -> tuple[int, int, int]:
     """Write the memory of the coming step: the points just solved, and all loaded points between rocks at rest.
+
+    The latter come first and are not moved: what is solved again leaves a gap (pair -1), so that a step in which little
+    is awake writes little. Gaps are closed when they are many.
 
     Args:
         n_rocks: number of rocks.
-        status: (n,) of each rock, see `broad_phase`; 0 is awake.
-        old: memory of the last step.
-        active, n_active: its rows that were looked up, see `index_memory`; the others are kept.
+        old: memory of the last step; n_idle of its points, the first, are of rocks that were at rest then.
+        active, n_active, n_gaps: its rows that were looked up, and its gaps, see `index_memory`; the others are kept.
         rows, n_rows: contact rows after the solve.
         rotations: (n, 3, 3) of the rocks at the poses of the solve.
         velocities: (n, 6) of the rocks over the step [rad/s, m/s].
         time_step: [s].
         near_gap: points without load are kept up to this gap [m], while there is room.
-        new: set, as many rows as there are points.
+        new: set, as many rows as there are points, but for those of `old` that stay in their places.
 
     Returns:
-        the number of points; beyond the capacity they are counted but lost. And how many of them, the first, are of
-        rocks at rest.
+        the number of points, gaps included; beyond the capacity they are counted but lost. How many of them, the
+        first, are of rocks at rest. And how many of these, the first, stay in their places or leave a gap there.
     """
-    n_new = 0
-    next_active = 0
     capacity = len(new.pairs)
-    for row in range(len(old.pairs)):
+    n_freed = 0
+    while n_freed < n_active and active[n_freed] < n_idle:
+        n_freed += 1
+    next_active = 0
+    n_kept = 0
+    if (n_gaps + n_freed) * MAX_GAPS < n_idle and len(old.pairs) + n_rows <= capacity:
+        n_kept = n_idle
+        n_gaps += n_freed
+        next_active = n_freed
+        for k in range(n_freed):
+            new.pairs[active[k], 0], new.pairs[active[k], 1] = -1, -1
+    else:
+        n_gaps = 0
+    n_new = n_kept
+    for row in range(n_kept, len(old.pairs)):
         if next_active < n_active and active[next_active] == row:
             next_active += 1
             continue
         a, b = old.pairs[row, 0], old.pairs[row, 1]
-        if status[a] == 3 or (b < n_rocks and status[b] == 3) or not is_loaded(old, row):
+        if a < 0 or not is_loaded(old, row):
             continue
         if n_new < capacity:
             new.pairs[n_new, 0], new.pairs[n_new, 1] = a, b
@@ -316,7 +343,7 @@ def write_memory(
                 new.values[n_new, d] = old.values[row, d]
         n_new += 1
     n_idle = n_new
-    room_for_near = NEAR_SHARE * capacity
+    room_for_near = NEAR_SHARE * capacity + n_gaps
     for k in range(n_rows):
         row = rows.values[k]
         normal, tangent_1, tangent_2 = row[IMPULSE], row[IMPULSE + 1], row[IMPULSE + 2]
@@ -348,7 +375,7 @@ def write_memory(
                     normal * row[NORMAL + d] + tangent_1 * row[TANGENT_1 + d] + tangent_2 * row[TANGENT_2 + d]
                 )
         n_new += 1
-    return n_new, min(n_idle, capacity)
+    return n_new, min(n_idle, capacity), n_kept
 
 
 @kernel
@@ -388,6 +415,8 @@ def sum_impulses(memory: Memory, n_rocks: int, sums: Array) -> None:
     sums[:] = 0.0
     for row in range(len(memory.pairs)):
         a, b = memory.pairs[row, 0], memory.pairs[row, 1]
+        if a < 0:
+            continue
         for d in range(3):
             sums[a, d] -= memory.values[row, MEMORY_IMPULSE + d]
         if b < n_rocks:
@@ -401,7 +430,7 @@ def sum_pressures(memory: Memory, n_rocks: int, chosen: Array, pressures: Array)
     pressures[:] = 0.0
     for row in range(len(memory.pairs)):
         a, b = memory.pairs[row, 0], memory.pairs[row, 1]
-        if chosen[a] or (b < n_rocks and chosen[b]):
+        if a >= 0 and (chosen[a] or (b < n_rocks and chosen[b])):
             size2 = 0.0
             for d in range(3):
                 size2 += memory.values[row, MEMORY_IMPULSE + d] ** 2

@@ -92,7 +92,7 @@ class RockArrays:
         velocities: (n, 6) angular, translational in W.
         book: (n, reduction.BOOK_WIDTH) status and bookkeeping of the reduction.
         memory: of m contact points, loaded or about to touch; m changes from step to step.
-        n_idle: so many of them, the first, are of rocks that were at rest in the last step.
+        n_idle: so many of them, the first, are of rocks that were at rest in the last step; gaps among them.
         steps: how many have been taken.
     """
 
@@ -114,6 +114,8 @@ class StepReport:
             torque [N m], force [N].
         machine_velocity: (v,) the machine's generalised velocities as the contact solve left them.
         awake: (m,) the rocks awake in the step, the only ones that moved.
+        n_kept: so many points of the memory, the first, are where they were, but for those that left gaps.
+        freed: (g,) these.
         n_contacts: contact points; n_loaded of them carry load.
         n_sweeps: sweeps of the resting stage.
         residual: the last one's change of the normal impulses over their sum or the weight, see `solve_resting`.
@@ -128,6 +130,8 @@ class StepReport:
     F_Bs_W: Array
     machine_velocity: Array
     awake: IntArray
+    n_kept: int
+    freed: IntArray
     n_contacts: int
     n_loaded: int
     n_sweeps: int
@@ -351,7 +355,7 @@ class NonsmoothEngine:
         pairs, rows = arrays.memory.pairs.astype(np.int64), arrays.memory.values
         # The machine's are not the pile's, and what carries no load is found again.
         loaded = rows[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3].any(axis=1)
-        kept = loaded & (pairs[:, 1] < self.first_piece)
+        kept = loaded & (pairs[:, 0] >= 0) & (pairs[:, 1] < self.first_piece)
         pairs, rows = pairs[kept], rows[kept]
         # Surfaces of the site are -1, -2, ...: independent of the number of rocks.
         surface = pairs[:, 1] >= self.n_rocks
@@ -428,26 +432,25 @@ class NonsmoothEngine:
         Args:
             arrays: state at t_n; not changed.
             machine: the machine at t_n, see `MachineStep`.
-            room: where the result is written, see `make_room`; new if None. Rows of poses and velocities of rocks that
-                are not awake are left as they are in it: they are those before the step. To copy them in every step
-                would take as long as all passes over resting rocks.
+            room: where the result is written, see `make_room`; new if None. What the step does not change of poses,
+                velocities and memory is left as it is in it, see `write_changes`. To copy it in every step would take
+                as long as all passes over resting rocks.
 
         Returns:
             state at t_n + dt, and the report.
 
         Raises:
-            SimulationFailure: the result is not finite or has not converged, also when solved again with
-                `RETRY_FACTOR` times the iterations and without momentum.
+            SimulationFailure: poses, or velocities of awake rocks, are not finite; or the result is not finite or has
+                not converged, also when solved again with `RETRY_FACTOR` times the iterations and without momentum.
         """
-        for name in MOTION:
-            if not motion.are_finite(getattr(arrays, name)):
-                raise SimulationFailure(f"rocks: {name} that are not finite")
         iterations, momentum = self.config.iterations, self.config.momentum
         self._foreseen[:] = 0.0
         if room is None:
             room = self.make_room()
             for name in MOTION:
                 getattr(room, name)[:] = getattr(arrays, name)
+            for old, copied in zip(arrays.memory, room.memory, strict=True):
+                copied[: len(old)] = old
         new, report = self._try_step(arrays, machine, room, iterations, momentum, warm=True, search_all=False)
         if new is not None and report is not None and report.residual <= self.config.max_residual:
             if report.n_foreseen == 0:
@@ -468,6 +471,21 @@ class NonsmoothEngine:
                 f"{better.n_sweeps} iterations (max_residual {self.config.max_residual:g})"
             )
         return again, _mark_redone(better)
+
+    def write_changes(self, new: RockArrays, report: StepReport, target: RockArrays) -> None:
+        """Write what a step has changed into a copy of the state before it.
+
+        Args:
+            new, report: what `step` gave.
+            target: changed, all but `n_idle` and `steps`; the memory has its full capacity.
+        """
+        for name in MOTION:
+            getattr(target, name)[report.awake] = getattr(new, name)[report.awake]
+        target.book[:] = new.book
+        target.memory.pairs[report.freed] = -1
+        changed = slice(report.n_kept, len(new.memory.pairs))
+        for before, after in zip(target.memory, new.memory, strict=True):
+            before[changed] = after[changed]
 
     def _try_step(
         self,
@@ -527,7 +545,7 @@ class NonsmoothEngine:
         )
 
         n_pairs = self._find_pairs(status)
-        places, n_active = contacts.index_memory(memory, n, status, self._active, self._table)
+        places, n_active, n_gaps = contacts.index_memory(memory, n, status, self._active, self._table)
         n_rows = self._find_contacts(n_pairs, memory, self._table[:places], n_active)
         rows, body_a, body_b, *_ = self._rows
         if contacts.find_deepest(self._rows, n_rows) > DEEP_SHARE * config.max_penetration:
@@ -567,8 +585,8 @@ class NonsmoothEngine:
             self._bodies_32[:] = 0.0
             self._velocities[:] = 0.0
             return None, None
-        n_memory, n_idle = contacts.write_memory(
-            n, status, memory, self._active, n_active, self._rows, n_rows,
+        n_memory, n_idle, n_kept = contacts.write_memory(
+            n, memory, arrays.n_idle, self._active, n_active, n_gaps, self._rows, n_rows,
             self._collision_bodies.rotations, self._velocities, dt,
             2.0 * config.search_distance, new.memory,
         )  # fmt: skip
@@ -599,6 +617,8 @@ class NonsmoothEngine:
             / dt,
             machine_velocity=velocity,
             awake=awake,
+            n_kept=n_kept,
+            freed=self._active[: np.searchsorted(self._active[:n_active], n_kept)].copy(),
             n_contacts=n_rows,
             n_loaded=n_loaded,
             n_sweeps=iterations,
@@ -627,6 +647,10 @@ class NonsmoothEngine:
             bodies.positions,
             self._stale,
         )
+        # What is not finite differs from itself, so it is among these.
+        for name in MOTION:
+            if not motion.are_finite(getattr(arrays, name), self._stale[:n_stale]):
+                raise SimulationFailure(f"rocks: {name} that are not finite")
         broad_phase.calc_poses(
             bodies.shape, bodies.scale, arrays.quaternions, arrays.positions, arrays.velocities, dt, margin,
             self.convex, self._stale[:n_stale], bodies.rotations, self._lower, self._upper,

@@ -15,14 +15,13 @@ HUGE = 1e9
 
 
 @allocating_kernel
-def are_finite(values: Array) -> bool:
-    """Return whether all values of a matrix are finite, and none is absurdly large."""
+def are_finite(values: Array, chosen: Array) -> bool:
+    """Return whether all values of the rows `chosen` of a matrix are finite, and none is absurdly large."""
     finite = True
-    flat = values.ravel()
-    # Without a way out on the first, which would keep the compiler from making vectors of the loop.
-    for k in range(len(flat)):
-        # Not math.isfinite: with sums reordered it is compiled to True.
-        finite &= abs(flat[k]) < HUGE
+    for k in range(len(chosen)):
+        for d in range(values.shape[1]):
+            # Not math.isfinite: with sums reordered it is compiled to True.
+            finite &= abs(values[chosen[k], d]) < HUGE
     return finite
 
 

@@ -231,7 +231,7 @@ def _sum_where_touched(book: Array, memory: Memory, n_idle: int, touched: Array,
             touched[b] = True
     for row in range(len(memory.pairs)):
         a, b = memory.pairs[row, 0], memory.pairs[row, 1]
-        if not touched[a] and (b >= n or not touched[b]):
+        if a < 0 or (not touched[a] and (b >= n or not touched[b])):
             continue
         # What has left the site carries no more.
         if book[a, STATUS] == LOST or (b < n and book[b, STATUS] == LOST):

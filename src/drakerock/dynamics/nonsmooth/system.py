@@ -6,7 +6,7 @@ The system holds no physics of its own: its state is the engine's arrays, its up
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,6 @@ from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.nonsmooth import contacts, reduction
 from drakerock.dynamics.nonsmooth.coupling import MachineLayout, MachineView, make_machine_layout
 from drakerock.dynamics.nonsmooth.engine import (
-    MOTION,
     NonsmoothEngine,
     RockArrays,
     StepReport,
@@ -146,11 +145,15 @@ class NonsmoothRocks(LeafSystem):
         return self._solve(self.GetMyContextFromRoot(root_context))[1]
 
     def _get_arrays(self, context: Context) -> RockArrays:
+        discrete = context.get_discrete_state()
+        n_points, n_idle, steps = discrete.value(self._groups["counts"]).reshape(-1)
+        arrays = self._view({name: discrete.value(group).reshape(-1) for name, group in self._groups.items()})
+        memory = arrays.memory.select(slice(int(n_points)))
+        return replace(arrays, memory=memory, n_idle=int(n_idle), steps=int(steps))
+
+    def _view(self, state: dict[str, Array]) -> RockArrays:
+        """Return arrays that are in the state's, memory with its full capacity, without the counts."""
         n = self._engine.n_rocks
-        state = {
-            name: context.get_discrete_state(group).value().reshape(-1)
-            for name, group in self._groups.items()
-        }
         return RockArrays(
             state["quaternions"].reshape(n, 4),
             state["positions"].reshape(n, 3),
@@ -159,9 +162,7 @@ class NonsmoothRocks(LeafSystem):
             contacts.Memory(
                 state["pairs"].view(np.int32).reshape(-1, 2),
                 state["memory"].view(np.float32).reshape(-1, contacts.MEMORY_WIDTH),
-            ).select(slice(int(state["counts"][0]))),
-            int(state["counts"][1]),
-            int(state["counts"][2]),
+            ),
         )
 
     def _write(self, discrete: DiscreteValues, values: dict[str, Array]) -> None:
@@ -196,13 +197,11 @@ class NonsmoothRocks(LeafSystem):
             "n_flagged": last[_N_FLAGGED] + report.flagged,
         }
         summary = [float(values[name]) for name in ROCK_SUMMARY]
-        new = _flatten(arrays, np.concatenate([summary, F_B_W]))
-        # What is written to begins as a copy of the state before the step: only the awake have moved.
-        for name in MOTION:
-            before = discrete.get_mutable_value(self._groups[name]).reshape(self._engine.n_rocks, -1)
-            before[report.awake] = getattr(arrays, name)[report.awake]
-            del new[name]
-        self._write(discrete, new)
+        # What is written to begins as a copy of the state before the step.
+        state = {name: discrete.get_mutable_value(group) for name, group in self._groups.items()}
+        self._engine.write_changes(arrays, report, self._view(state))
+        state["counts"][:] = _count(arrays)
+        state["report"][:] = [*summary, *F_B_W]
 
     def _calc_poses(self, context: Context, output: BasicVector) -> None:
         arrays = self._get_arrays(context)
@@ -237,15 +236,19 @@ _N_LOST = list(ROCK_SUMMARY).index("n_lost")
 _N_FLAGGED = list(ROCK_SUMMARY).index("n_flagged")
 
 
-def _flatten(arrays: RockArrays, report: Array | None = None) -> dict[str, Array]:
+def _count(arrays: RockArrays) -> Array:
+    return np.array([len(arrays.memory.pairs), arrays.n_idle, arrays.steps], float)
+
+
+def _flatten(arrays: RockArrays) -> dict[str, Array]:
     return {
         "quaternions": arrays.quaternions.reshape(-1),
         "positions": arrays.positions.reshape(-1),
         "velocities": arrays.velocities.reshape(-1),
         "book": arrays.book.reshape(-1),
         **_flatten_memory(arrays.memory),
-        "counts": np.array([len(arrays.memory.pairs), arrays.n_idle, arrays.steps], float),
-        "report": np.zeros(len(ROCK_SUMMARY) + 6) if report is None else report,
+        "counts": _count(arrays),
+        "report": np.zeros(len(ROCK_SUMMARY) + 6),
     }
 
 

@@ -147,13 +147,13 @@ def test_contact_memory_is_found_again():
     assert pressures[0] == pytest.approx(0.5 * np.linalg.norm(impulses, axis=1).sum(), rel=1e-5)
     table = np.zeros(128, np.int64)
     status, active = np.zeros(1, np.int64), np.zeros(8, np.int64)
-    assert contacts.index_memory(arrays.memory, 1, status, active, table) == (64, 4)
+    assert contacts.index_memory(arrays.memory, 1, status, active, table) == (64, 4, 0)
     table = table[:64]
     key = contacts.read_key(arrays.memory, 0)
     assert contacts.find_in_memory(key, arrays.memory, table) == 0
     assert contacts.find_in_memory(key + 1, arrays.memory, table) == -1
     # pairs without an awake rock are not searched
-    assert contacts.index_memory(arrays.memory, 1, status + 1, active, table) == (64, 0)
+    assert contacts.index_memory(arrays.memory, 1, status + 1, active, table) == (64, 0, 0)
     assert contacts.find_in_memory(key, arrays.memory, table) == -1
 
 
@@ -331,6 +331,84 @@ def test_a_step_into_given_room_is_the_same_step():
         assert np.array_equal(getattr(arrays, name), getattr(before, name))
 
 
+def wake_by_and_by(engine, arrays, woken):
+    """Yield the states of steps that begin with each of the rocks `woken` shoved in turn, and the reports."""
+    for rock in woken:
+        reduction.wake_rock(arrays.book, arrays.positions, rock)
+        arrays.velocities[rock, 5] = 0.02
+        arrays, report = engine.advance(arrays)
+        yield arrays, report
+
+
+def is_gap(arrays):
+    return arrays.memory.pairs[:, 0] < 0
+
+
+def settle_at_rest():
+    """Return 200 rocks that have come to rest, memory of resting rocks written, and their engine."""
+    engine, arrays = settle(200)
+    arrays.book[:, reduction.STATUS], arrays.book[:, reduction.CHANGED_STEPS] = RESTING, reduction.NEW
+    arrays.velocities[:] = 0.0
+    arrays, _ = engine.advance(arrays)
+    assert arrays.n_idle == len(arrays.memory.pairs) > 200
+    return engine, arrays
+
+
+def test_what_rocks_at_rest_remember_stays_in_its_place_and_gaps_change_nothing():
+    engine, arrays = settle_at_rest()
+    n_gaps = [0]
+    for new, report in wake_by_and_by(engine, arrays, range(0, 200, 5)):
+        gaps = is_gap(arrays)
+        closed = replace(
+            arrays, memory=arrays.memory.select(~gaps), n_idle=int((~gaps[: arrays.n_idle]).sum())
+        )
+        expected, _ = engine.advance(closed)
+        for name in ("positions", "quaternions", "velocities", "book"):
+            assert np.array_equal(getattr(new, name), getattr(expected, name)), name
+        for found, whole in zip(new.memory.select(~is_gap(new)), expected.memory, strict=False):
+            assert np.array_equal(found, whole[expected.memory.pairs[:, 0] >= 0])
+        assert np.array_equal(
+            engine.make_pile(new).contacts.impulses, engine.make_pile(expected).contacts.impulses
+        )
+        kept = np.setdiff1d(np.arange(report.n_kept), report.freed)
+        assert np.array_equal(new.memory.pairs[kept], arrays.memory.pairs[kept])
+        assert is_gap(new)[report.freed].all()
+        assert not is_gap(new)[new.n_idle :].any()
+        n_gaps.append(int(is_gap(new).sum()))
+        assert n_gaps[-1] <= new.n_idle / contacts.MAX_GAPS
+        arrays = new
+    # They become more, are closed, and become more again.
+    assert max(n_gaps) > 5
+    assert (np.diff(n_gaps) < -5).any()
+
+
+def test_changes_written_into_a_copy_are_the_whole_state():
+    engine, arrays = settle_at_rest()
+    capacity = len(engine.make_room().memory.pairs)
+    for new, _ in wake_by_and_by(engine, arrays, range(0, 200, 20)):
+        copy = replace(
+            arrays,
+            **{
+                name: getattr(arrays, name).copy()
+                for name in ("positions", "quaternions", "velocities", "book")
+            },
+            memory=contacts.make_memory(capacity),
+        )
+        for before, after in zip(copy.memory, arrays.memory, strict=True):
+            before[: len(after)] = after
+        room = engine.make_room()
+        room.memory.pairs[:], room.memory.values[:] = 7, np.nan
+        engine.write_changes(*engine.step(arrays, make_machineless_step(), room), copy)
+        for name in ("positions", "quaternions", "velocities", "book"):
+            assert np.array_equal(getattr(copy, name), getattr(new, name)), name
+        # What stands in a gap counts for nothing.
+        full = ~is_gap(new)
+        for found, whole in zip(copy.memory.select(slice(len(full))), new.memory, strict=True):
+            assert np.array_equal(found[full], whole[full])
+        assert np.array_equal(copy.memory.pairs[: len(full), 0] < 0, ~full)
+        arrays = new
+
+
 def test_two_contexts_keep_their_solutions_apart():
     """The solution of a context is not lost when that of its clone is found."""
     pile = draw_pile(3, 20)
@@ -358,11 +436,12 @@ def test_memory_keeps_keys_and_simplices_whole():
     rotations = np.zeros((contacts.KEY_STEP, 3, 3))
     rotations[rock] = np.eye(3)
     empty = np.zeros(0, np.int64)
-    n, n_idle = contacts.write_memory(
+    n, n_idle, n_kept = contacts.write_memory(
+        0,
+        contacts.make_memory(0),
         0,
         empty,
-        contacts.make_memory(0),
-        empty,
+        0,
         0,
         rows,
         1,
@@ -372,7 +451,7 @@ def test_memory_keeps_keys_and_simplices_whole():
         0.0,
         memory,
     )
-    assert (n, n_idle) == (1, 0)
+    assert (n, n_idle, n_kept) == (1, 0, 0)
     assert contacts.read_key(memory, 0) == key
     found = np.zeros((3, 2), np.int64)
     assert gjk.decode_simplex(contacts.read_simplex(memory, 0), found) == 3
@@ -428,11 +507,15 @@ def test_rocks_that_leave_the_site_are_counted_and_taken_out():
     assert report.n_awake == 1
 
 
-def test_values_that_are_not_finite_do_not_leave_a_step():
-    pile = make_pile([[0, 0, 0.25]])
+@pytest.mark.parametrize("status", [AWAKE, RESTING])
+def test_values_that_are_not_finite_do_not_leave_a_step(status):
+    pile = make_pile([[0, 0, 0.25], [2.0, 0, 0.25]])
     engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)])
     arrays = engine.make_arrays(pile)
-    for group in (arrays.velocities, arrays.positions, arrays.quaternions):
+    arrays.book[0, reduction.STATUS] = status
+    arrays, _ = engine.advance(arrays)
+    # The velocities of resting rocks are nowhere read.
+    for group in (arrays.positions, arrays.quaternions, *[arrays.velocities] * (status == AWAKE)):
         before = group[0, 0]
         group[0, 0] = np.nan
         with pytest.raises(SimulationFailure, match="not finite"):
