@@ -1,8 +1,9 @@
 """The nonsmooth engine against the plant engine: the same machine digs the same small piles.
 
-    python benchmarks/compare_engines.py --rocks 300 --seeds 4 --points 1 --out build/engines.jsonl
+    python benchmarks/compare_engines.py digs --rocks 300 --seeds 4 --points 1 --out build/engines.jsonl
+    python benchmarks/compare_engines.py states --seeds 8 --variants nonsmooth,manifold_points=1 plant
 
-Each seed is one pile, filled and at rest in the nonsmooth engine, relaxed for a second in each engine with the
+`digs`: each seed is one pile, filled and at rest in the nonsmooth engine, relaxed for a second in each engine with the
 machine standing, then dug with the same motor targets. Finished runs are skipped. `--points 1`: the nonsmooth engine
 with one contact point per pair, as the plant engine's point contact has it. `--against hydroelastic`: the plant engine
 with pressure fields over faces instead of single points, five times as dear. `--set damping_time=2`: another setting of
@@ -11,6 +12,10 @@ stiffness_factor=0.73 --dissipation 0` is one contact law in both: a spring of t
 an implicit Euler step makes it (the plant's usual Hunt-Crossley dissipation has no counterpart in the other).
 `--repeats 3`: each pile is dug three times in the nonsmooth engine, with one more iteration each, and their mean taken:
 digs are chaotic, these are cheap.
+
+`states` stops a dig of the first variant every half second; all variants go on from there for 0.3 s, and their pushes
+are compared. A variant is an engine with settings of its own, `time_step` and the plant's `dissipation` among them.
+That tells within minutes where engines, contact laws or time steps part, which whole digs hide in chaos.
 """
 
 from __future__ import annotations
@@ -18,7 +23,8 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -40,77 +46,126 @@ from drakerock.pile.state import PileState
 
 METRICS = ("bucket_mass_kg", "peak_push_kN", "mean_push_kN", "displaced_m3", "reach_m")
 RELAXING = 1.0
+SMALL_SITE = SIZES["300"][1]
+# Of `states`: when digs are stopped [s], and between which times after it pushes are compared [s]. States whose push is
+# below this say nothing [kN].
+STATE_TIMES, STATE_WINDOWS, MIN_PUSH = np.arange(1.0, 6.1, 0.5), (0.0, 0.05, 0.1, 0.2, 0.3), 20.0
+
+
+@dataclass(frozen=True)
+class Variant:
+    """An engine with its settings; `nonsmooth` are those of the nonsmooth engine."""
+
+    engine: str
+    nonsmooth: dict[str, float]
+    dissipation: float = PlantEngineConfig().dissipation
+    time_step: float = TIME_STEP
+    name: str = ""
+
+
+def parse_variant(text: str) -> Variant:
+    """Return the variant of a text such as `nonsmooth,manifold_points=1,time_step=0.005`."""
+    engine, *items = text.split(",")
+    if engine not in ("nonsmooth", "plant", "hydroelastic"):
+        raise argparse.ArgumentTypeError(f"{engine}: one of nonsmooth, plant, hydroelastic")
+    settings = {key: float(value) for key, value in (item.split("=") for item in items)}
+    general = {key: settings.pop(key) for key in ("dissipation", "time_step") if key in settings}
+    return Variant(engine, settings, **general, name=text)
+
+
+class Dig:
+    """A machine before a pile on the small site: it stands still for a second, then digs.
+
+    Args:
+        pile: the rocks.
+        variant: what moves them.
+        site: where.
+        depth: of the dig [m].
+    """
+
+    def __init__(self, pile: PileState, variant: Variant, site: SiteConfig, depth: float) -> None:
+        dynamics = DynamicsConfig(
+            rocks="nonsmooth" if variant.engine == "nonsmooth" else "plant",
+            nonsmooth=NonsmoothConfig(reduction="none", **variant.nonsmooth),
+            plant=PlantEngineConfig(
+                contact_model="hydroelastic" if variant.engine == "hydroelastic" else "point",
+                dissipation=variant.dissipation,
+            ),
+            time_step=variant.time_step,
+        )
+        builder = DiagramBuilder()
+        self.plant, scene_graph = add_plant(builder, dynamics)
+        built = make_site(site)
+        add_site(self.plant, built, dynamics)
+        self.machine = add_machine(self.plant, MachineConfig())
+        inputs = []
+        if dynamics.rocks == "plant":
+            geometries = add_rock_bodies(self.plant, pile, SHAPES, ROCKS, dynamics)
+            self.plant.Finalize()
+            self.rocks = add_plant_rocks(builder, self.plant, pile, geometries)
+        else:
+            self.plant.Finalize()
+            self.rocks, view = add_nonsmooth_rocks(
+                builder, self.plant, scene_graph, self.machine, built, SHAPES, ROCKS, dynamics, pile
+            )
+            inputs.append(view.GetInputPort("desired_state"))
+        inputs.append(self.plant.get_desired_state_input_port(self.machine.instance))
+        rates = make_dig(depth)
+
+        def delayed(t: float) -> np.ndarray:
+            wanted = rates(t - RELAXING) if t > RELAXING else (0.0, 0.0, 0.0)
+            return calc_motor_targets(self.plant, self.machine, *wanted)
+
+        motors = builder.AddSystem(Motors(delayed, len(delayed(0.0))))
+        for port in inputs:
+            builder.Connect(motors.GetOutputPort("desired_state"), port)
+        self.simulator = Simulator(builder.Build())
+        self.root = self.simulator.get_mutable_context()
+        self.plant_context = self.plant.GetMyMutableContextFromRoot(self.root)
+        self.rocks.set_pile(self.root, pile)
+        x_tip = float(pile.p_WRs[:, 0].min()) - 0.7
+        set_machine_pose(self.plant, self.plant_context, self.machine, x_tip=x_tip, z_tip=0.02)
+        self.simulator.Initialize()
+
+    def go_on_from(self, other: Dig) -> None:
+        """Take over the time and the state of the machine of another dig, whose pile this one was made with."""
+        self.root.SetTime(other.root.get_time())
+        of_machine = self.machine.instance, other.machine.instance
+        self.plant.SetPositionsAndVelocities(
+            self.plant_context,
+            of_machine[0],
+            other.plant.GetPositionsAndVelocities(other.plant_context, of_machine[1]),
+        )
+        self.simulator.Initialize()
+
+    def advance(self, duration: float) -> Iterator[float]:
+        """Go on so long [s]; yield the push on the rocks after each step [N]."""
+        start, time_step = self.root.get_time(), self.plant.time_step()
+        context = self.rocks.GetMyContextFromRoot(self.root)
+        for k in range(round(duration / time_step)):
+            self.simulator.AdvanceTo(start + (k + 1) * time_step)
+            yield -self.rocks.GetOutputPort("F_B_W").Eval(context)[3]
+
+    def get_reach(self) -> float:
+        """Return where the tip of the bucket is along x [m]."""
+        return float(self.plant.GetFrameByName("tip").CalcPoseInWorld(self.plant_context).translation()[0])
 
 
 def run(
-    pile: PileState,
-    engine: str,
-    site: SiteConfig,
-    depth: float,
-    duration: float,
-    dissipation: float,
-    settings: dict[str, float],
+    pile: PileState, variant: Variant, site: SiteConfig, depth: float, duration: float
 ) -> dict[str, float]:
-    nonsmooth = engine.startswith("nonsmooth")
-    dynamics = DynamicsConfig(
-        rocks="nonsmooth" if nonsmooth else "plant",
-        nonsmooth=NonsmoothConfig(
-            reduction="none",
-            manifold_points=int(engine.removeprefix("nonsmooth-")) if nonsmooth else 4,
-            **settings,
-        ),
-        plant=PlantEngineConfig(
-            contact_model="hydroelastic" if engine == "hydroelastic" else "point", dissipation=dissipation
-        ),
-        time_step=TIME_STEP,
-    )
-    builder = DiagramBuilder()
-    plant, scene_graph = add_plant(builder, dynamics)
-    built = make_site(site)
-    add_site(plant, built, dynamics)
-    machine = add_machine(plant, MachineConfig())
-    inputs = []
-    if dynamics.rocks == "plant":
-        geometries = add_rock_bodies(plant, pile, SHAPES, ROCKS, dynamics)
-        plant.Finalize()
-        rocks = add_plant_rocks(builder, plant, pile, geometries)
-    else:
-        plant.Finalize()
-        rocks, view = add_nonsmooth_rocks(
-            builder, plant, scene_graph, machine, built, SHAPES, ROCKS, dynamics, pile
-        )
-        inputs.append(view.GetInputPort("desired_state"))
-    inputs.append(plant.get_desired_state_input_port(machine.instance))
-    rates = make_dig(depth)
-
-    def delayed(t: float) -> np.ndarray:
-        wanted = rates(t - RELAXING) if t > RELAXING else (0.0, 0.0, 0.0)
-        return calc_motor_targets(plant, machine, *wanted)
-
-    motors = builder.AddSystem(Motors(delayed, len(delayed(0.0))))
-    for port in inputs:
-        builder.Connect(motors.GetOutputPort("desired_state"), port)
-    simulator = Simulator(builder.Build())
-    root = simulator.get_mutable_context()
-    rocks.set_pile(root, pile)
-    context = rocks.GetMyContextFromRoot(root)
-    plant_context = plant.GetMyMutableContextFromRoot(root)
-    set_machine_pose(plant, plant_context, machine, x_tip=float(pile.p_WRs[:, 0].min()) - 0.7, z_tip=0.02)
-    simulator.Initialize()
-    tip, bucket = plant.GetFrameByName("tip"), plant.GetBodyByName("bucket")
-    start = tip.CalcPoseInWorld(plant_context).translation()[0]
-    n = round(duration / TIME_STEP)
-    push, reach = np.zeros(n), np.zeros(n)
-    simulator.AdvanceTo(RELAXING)
-    before = rocks.get_pile(root).p_WRs
+    dig = Dig(pile, variant, site, depth)
+    start = dig.get_reach()
+    dig.simulator.AdvanceTo(RELAXING)
+    before = dig.rocks.get_pile(dig.root).p_WRs
+    push, reach = [], []
     cpu = time.process_time()
-    for k in range(n):
-        simulator.AdvanceTo(RELAXING + (k + 1) * TIME_STEP)
-        push[k] = -rocks.GetOutputPort("F_B_W").Eval(context)[3]
-        reach[k] = tip.CalcPoseInWorld(plant_context).translation()[0] - start
+    for force in dig.advance(duration):
+        push.append(force)
+        reach.append(dig.get_reach() - start)
     cpu = time.process_time() - cpu
-    after = rocks.get_pile(root).p_WRs
-    X_WB = plant.EvalBodyPoseInWorld(plant_context, bucket)
+    after = dig.rocks.get_pile(dig.root).p_WRs
+    X_WB = dig.plant.EvalBodyPoseInWorld(dig.plant_context, dig.plant.GetBodyByName("bucket"))
     local = (after - X_WB.translation()) @ X_WB.rotation().matrix()
     inside = (np.abs(local - [0.95, 0.0, 0.9]) < [1.15, 1.5, 1.4]).all(axis=1)
     masses = pile.calc_masses(np.array([shape.volume for shape in SHAPES]), ROCKS.density)
@@ -118,33 +173,62 @@ def run(
     return {
         "bucket_mass_kg": float(masses[inside].sum()),
         "peak_push_kN": float(smooth.max()) / 1e3,
-        "mean_push_kN": float(push[:600].clip(0.0).mean()) / 1e3,
+        "mean_push_kN": float(np.clip(push[:600], 0.0, None).mean()) / 1e3,
         "displaced_m3": float(masses[np.linalg.norm(after - before, axis=1) > 0.05].sum() / ROCKS.density),
-        "reach_m": float(reach.max()),
+        "reach_m": float(np.max(reach)),
         "cpu_s": cpu,
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rocks", type=int, default=300)
-    parser.add_argument("--seeds", type=int, default=4)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--points", type=int, choices=range(1, 5), default=4)
-    parser.add_argument("--duration", type=float, default=10.0)
-    parser.add_argument("--against", choices=("plant", "hydroelastic"), default="plant")
-    parser.add_argument(
-        "--dissipation", type=float, default=PlantEngineConfig().dissipation, help="of the plant's"
-    )
-    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="of the nonsmooth engine")
-    parser.add_argument("--repeats", type=int, default=1, help="digs of a pile in the nonsmooth engine")
-    parser.add_argument("--out", type=Path, default=Path("build/engines.jsonl"))
-    arguments = parser.parse_args()
+def make_start(rocks: int, seed: int) -> tuple[PileState, float]:
+    """Return a seed's pile, at rest, and the depth of its dig [m]."""
+    pile = clear_way(make_small_pile(rocks, SMALL_SITE, 6.0, seed))
+    depth = np.random.default_rng(seed).uniform(0.6, 1.4)
+    return replace(pile, V_WRs=np.zeros((len(pile), 6))), depth
+
+
+def compare_states(arguments: argparse.Namespace) -> None:
+    """Go on from the states of digs of the first variant with each of them; print their pushes."""
+    common = parse_variant(",".join(["nonsmooth", *arguments.set])).nonsmooth
+    variants = [replace(one, nonsmooth=common | one.nonsmooth) for one in arguments.variants]
+    windows = [round(edge / TIME_STEP) for edge in STATE_WINDOWS]
+    found: list[list[list[float]]] = [[] for _ in variants]
+    for seed in range(arguments.first, arguments.first + arguments.seeds):
+        pile, depth = make_start(arguments.rocks, seed)
+        dig = Dig(pile, variants[0], SMALL_SITE, depth)
+        for t in STATE_TIMES:
+            dig.simulator.AdvanceTo(RELAXING + t)
+            state = dig.rocks.get_pile(dig.root)
+            for variant, pushes in zip(variants, found, strict=True):
+                other = Dig(state, variant, SMALL_SITE, depth)
+                other.go_on_from(dig)
+                push = np.array(list(other.advance(STATE_WINDOWS[-1]))) / 1e3
+                # Forces of steps of any length, as means over usual steps.
+                push = push.reshape(windows[-1], -1).mean(axis=1)
+                pushes.append([float(part.mean()) for part in np.split(push, windows[1:-1])])
+        print(f"pile {seed}: {len(found[0])} states", flush=True)
+        print_states(variants, found)
+
+
+def print_states(variants: list[Variant], found: list[list[list[float]]]) -> None:
+    base = np.array(found[0])
+    pushed = base.mean(axis=1) > MIN_PUSH
+    if pushed.sum() < 2:
+        return
+    for variant, pushes in zip(variants, found, strict=True):
+        cells = []
+        for a, b in zip(np.array(pushes)[pushed].T, base[pushed].T, strict=True):
+            mean, half = compare(a, b)
+            cells.append(f"{a.mean():6.1f} ({100 * mean / b.mean():+5.1f} ± {100 * half / b.mean():4.1f} %)")
+        print(f"{', '.join(cells)}  {variant.name}", flush=True)
+
+
+def compare_digs(arguments: argparse.Namespace) -> None:
+    """Dig the piles in both engines, unless that is stored; print the differences."""
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
     results = {(r["seed"], r["engine"], r.get("repeat", 0)): r for r in map(json.loads, lines)}
-    site = SIZES["300"][1]
-    settings = {key: float(value) for key, value in (item.split("=") for item in arguments.set)}
+    settings = parse_variant(",".join(["nonsmooth", *arguments.set])).nonsmooth
     iterations = settings.pop("iterations", float(NonsmoothConfig().iterations))
     ours = f"nonsmooth-{arguments.points}"
     digs = [(arguments.against, 0)] + [(ours, repeat) for repeat in range(arguments.repeats)]
@@ -153,19 +237,13 @@ def main() -> None:
         todo = [dig for dig in digs if (seed, *dig) not in results]
         if not todo:
             continue
-        pile = clear_way(make_small_pile(arguments.rocks, site, 6.0, seed))
-        pile = replace(pile, V_WRs=np.zeros((len(pile), 6)))
-        depth = np.random.default_rng(seed).uniform(0.6, 1.4)
+        pile, depth = make_start(arguments.rocks, seed)
         for engine, repeat in todo:
-            result = run(
-                pile,
-                engine,
-                site,
-                depth,
-                arguments.duration,
-                arguments.dissipation,
-                {**settings, "iterations": iterations + repeat},
+            own = {"manifold_points": float(arguments.points), "iterations": iterations + repeat}
+            variant = Variant(
+                "nonsmooth" if engine == ours else engine, settings | own, arguments.dissipation
             )
+            result = run(pile, variant, SMALL_SITE, depth, arguments.duration)
             results[seed, engine, repeat] = result
             entry = {"seed": seed, "engine": engine, "repeat": repeat, "rocks": len(pile), **result}
             with open(arguments.out, "a", encoding="utf-8") as file:
@@ -182,6 +260,33 @@ def main() -> None:
         text = f"{metric}: {ours} {a.mean():.4g}, {arguments.against} {b.mean():.4g}"
         share = 100 / b.mean()
         print(f"{text}, difference {share * mean:+.1f} ± {share * half:.1f} % (90 %, {len(a)} pairs)")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    commands = parser.add_subparsers(required=True)
+    digs, states = commands.add_parser("digs"), commands.add_parser("states")
+    for command, work in ((digs, compare_digs), (states, compare_states)):
+        command.set_defaults(work=work)
+        command.add_argument("--rocks", type=int, default=300)
+        command.add_argument("--seeds", type=int, default=4)
+        command.add_argument("--first", type=int, default=0)
+        command.add_argument(
+            "--set", nargs="*", default=[], metavar="KEY=VALUE", help="of the nonsmooth engine"
+        )
+    digs.add_argument("--points", type=int, choices=range(1, 5), default=4)
+    digs.add_argument("--duration", type=float, default=10.0)
+    digs.add_argument("--against", choices=("plant", "hydroelastic"), default="plant")
+    digs.add_argument(
+        "--dissipation", type=float, default=PlantEngineConfig().dissipation, help="of the plant's"
+    )
+    digs.add_argument("--repeats", type=int, default=1, help="digs of a pile in the nonsmooth engine")
+    digs.add_argument("--out", type=Path, default=Path("build/engines.jsonl"))
+    states.add_argument(
+        "--variants", nargs="+", type=parse_variant, required=True, metavar="ENGINE[,KEY=VALUE]..."
+    )
+    arguments = parser.parse_args()
+    arguments.work(arguments)
 
 
 if __name__ == "__main__":

@@ -62,6 +62,46 @@ def test_sliding_distance():
     assert np.abs(arrays.velocities).max() < 1e-3
 
 
+@pytest.mark.parametrize("time_step", [0.002, 0.0005])
+@pytest.mark.parametrize("height", [0.0003, 0.0013])
+def test_an_impact_by_the_linear_law_is_that_of_springs(time_step, height):
+    """Without rigid impacts a block at speed v goes v sqrt(m / k) deep and, undamped, leaves as fast as it came."""
+    speed, size = 0.5, 0.5
+    pile = make_pile([[0, 0, 0.5 * size + height]], size=[size], velocities=[[0, 0, 0, 0, 0, -speed]])
+    config = NonsmoothConfig(
+        reduction="none", linear_overlap=0.001, stiffness_factor=0.02, damping_time=0.0, impact_threshold=50
+    )
+    engine = make_engine(pile, [make_box(1.0, 1.0, 1.0)], config=config, time_step=time_step, gravity=0.0)
+    stiffness = 4 * engine.hertz * np.sqrt(config.linear_overlap * size)  # four corners
+    arrays, depth = engine.make_arrays(pile), 0.0
+    for _ in range(round(0.2 / time_step)):
+        arrays, _ = engine.advance(arrays)
+        depth = max(depth, 0.5 * size - arrays.positions[0, 2])
+    assert depth == pytest.approx(speed * np.sqrt(engine.mass[0] / stiffness), rel=0.05)
+    # The first step of a contact is an implicit one, which takes a share of h / 2 sqrt(k / m) of the speed at most.
+    loss = 0.5 * time_step * np.sqrt(stiffness / engine.mass[0])
+    assert speed * (1 - loss - 1e-3) < arrays.velocities[0, 5] < speed * 1.001
+
+
+@pytest.mark.parametrize("time_step", [0.01, 0.002])
+def test_a_load_is_carried_however_slow_overlaps_may_be_pushed_apart(time_step):
+    """What bounds the speed of overlaps that are pushed apart bounds no force: the overlap is weight over stiffness."""
+    pile = make_pile([[0, 0, 0.25]], size=[0.5])
+    config = NonsmoothConfig(
+        reduction="none",
+        linear_overlap=0.001,
+        stiffness_factor=2e-3,
+        max_recovery_speed=0.1,
+        impact_threshold=50,
+    )
+    engine = make_engine(pile, [make_box(1.0, 1.0, 1.0)], config=config, time_step=time_step)
+    stiffness = 4 * engine.hertz * np.sqrt(config.linear_overlap * 0.5)
+    arrays, _ = run(engine, engine.make_arrays(pile), 3.0)
+    overlap = engine.mass[0] * G / stiffness
+    assert overlap > 5 * config.max_recovery_speed * 0.002
+    assert 0.25 - arrays.positions[0, 2] == pytest.approx(overlap, rel=0.01)
+
+
 def make_still_machine(pose, n_bodies=1):
     """A machine that cannot move: no velocities at all."""
     return make_machine_step(

@@ -82,14 +82,15 @@ class NonsmoothConfig(Config):
         float,
         Field(
             ge=0,
-            description="0: Hertz's law; above: linear, with Hertz's force at this overlap, as in the plant engine [m]",
+            description="0: Hertz's law, and what comes near is met rigidly; above: linear, with Hertz's force at this "
+            "overlap, also for what comes near, as in the plant engine [m]",
         ),
     ] = 0.0
     spin_damping: Annotated[
         float, Field(ge=0, le=20, description="each loaded contact damps the pair's relative spin [1/s]")
     ] = 2.0
     max_recovery_speed: Annotated[
-        float, Field(gt=0, description="overlaps are pushed apart at most this fast [m/s]")
+        float, Field(gt=0, description="overlaps without load are pushed apart at most this fast [m/s]")
     ] = 1.0
     rounding: Annotated[
         float, Field(gt=0, le=0.1, description="rounding of the rocks' edges [sieve width]")

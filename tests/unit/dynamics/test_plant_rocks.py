@@ -74,6 +74,21 @@ def test_fixed_rocks_do_not_move(heap, shapes):
     assert np.linalg.norm(after.p_WRs[3:] - pile.p_WRs[3:], axis=1).max() > 0.01
 
 
+def test_hundreds_of_fixed_rocks_are_no_trouble(heap, shapes):
+    """On the world's body, beside the floor, they made Drake 1.58 read stray memory."""
+    many = heap
+    for k in range(1, 30):
+        many = many.join(replace(heap, p_WRs=heap.p_WRs + [0.0, 0.0, 3.0 * k]))
+    pile = replace(many, fixed=np.arange(len(many)) >= len(heap))
+    diagram, plant, rocks = build(pile, shapes)
+    simulator = Simulator(diagram)
+    rocks.set_pile(simulator.get_mutable_context(), pile)
+    simulator.AdvanceTo(0.1)
+    after = rocks.get_pile(simulator.get_context())
+    assert np.array_equal(after.p_WRs[pile.fixed], pile.p_WRs[pile.fixed])
+    assert len(plant.GetCollisionGeometriesForBody(plant.GetBodyByName("fixed_rocks"))) == 29 * len(heap)
+
+
 def test_effective_friction_of_every_pair_is_the_methods():
     builder = DiagramBuilder()
     plant, scene_graph = add_plant(builder, DynamicsConfig())

@@ -199,7 +199,8 @@ def index_memory(
             empty.
 
     Returns:
-        how many places are in use: a power of two; look up in ``table[:places]``. The number of active rows, and of gaps.
+        how many places are in use: a power of two; look up in ``table[:places]``. The number of active rows, and
+        of gaps.
     """
     n_active, n_gaps = 0, 0
     for row in range(len(memory.pairs)):

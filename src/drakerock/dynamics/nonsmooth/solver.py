@@ -229,7 +229,7 @@ def prepare_rows(
         hertz: 4/3 E*, E* the pair's effective modulus [Pa]: force = hertz sqrt(radius) overlap^(3/2).
         linear_overlap: if above 0, force = hertz sqrt(radius linear_overlap) overlap instead [m].
         time_step: [s]; upsilon: 1 / (1 + 4 tau / dt).
-        max_recovery_speed: at which overlaps are pushed apart at most [m/s].
+        max_recovery_speed: at which overlaps push apart what carries no load, at most [m/s].
         impact_threshold: what approaches faster is an impact [m/s].
 
     Returns:
@@ -266,19 +266,26 @@ def prepare_rows(
         compliance = 0.0
         if row[RESTITUTION] > 0.0 and _is_impact(gap, approach, time_step, impact_threshold):
             n_impacts += 1
+        # An impact without restitution is rigid, and none of its speed is kept.
+        rigid = approach < -impact_threshold
         if gap > 0.0:
-            # apart: they may approach until they touch at the end of the step
+            # Apart: they may approach until they touch at the end of the step; by a linear law, overlap then.
             bias = -gap / time_step
+            if linear_overlap > 0.0 and not rigid:
+                stiffness, _ = _calc_stiffness(gap, curvature[a] + curvature[b], hertz, linear_overlap)
+                compliance = 1.0 / (stiffness * time_step * time_step)
         else:
-            # A force that grows with this power of the overlap is, about it, a spring stretched by 1 / power of it.
-            power = 1.0 if linear_overlap > 0.0 else 1.5
-            bias = min(-4.0 * upsilon * (1.0 / power) * gap / time_step, max_recovery_speed)
-            # An impact without restitution is rigid, and none of its speed is kept.
-            if approach >= -impact_threshold:
-                overlap = linear_overlap if linear_overlap > 0.0 else max(-gap, MIN_OVERLAP)
-                stiffness = power * hertz * math.sqrt(overlap / (curvature[a] + curvature[b]))
+            stiffness, power = _calc_stiffness(gap, curvature[a] + curvature[b], hertz, linear_overlap)
+            bias = -4.0 * upsilon * (1.0 / power) * gap / time_step
+            if rigid:
+                bias = min(bias, max_recovery_speed)
+            else:
                 compliance = 4.0 * upsilon / (stiffness * time_step * time_step)
-                bias += upsilon * min(approach, 0.0)
+                # What is bounded is the speed that an overlap gives, not its force: the load of the last step, and
+                # what the approach adds to it, are carried.
+                closing = min(approach, 0.0)
+                carried = compliance * row[IMPULSE] - 4.0 * upsilon * closing
+                bias = min(bias, max_recovery_speed + carried) + upsilon * closing
         diagonal = _quadratic(mobility, nx, ny, nz, nx, ny, nz) + compliance
         determinant = m11 * m22 - m12 * m12
         # Two bodies that cannot move have no rows to solve.
@@ -298,6 +305,17 @@ def prepare_rows(
             row[IMPULSE + 1] *= limit / slip
             row[IMPULSE + 2] *= limit / slip
     return n_impacts
+
+
+@kernel
+def _calc_stiffness(gap: float, curvature: float, hertz: float, linear_overlap: float) -> tuple[float, float]:
+    """Return a contact's stiffness dF/dd [N/m], and the power of the overlap that its force grows with.
+
+    About an overlap the force is that of a spring of this stiffness, stretched by 1 / power of the overlap.
+    """
+    if linear_overlap > 0.0:
+        return hertz * math.sqrt(linear_overlap / curvature), 1.0
+    return 1.5 * hertz * math.sqrt(max(-gap, MIN_OVERLAP) / curvature), 1.5
 
 
 @kernel

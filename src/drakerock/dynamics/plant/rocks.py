@@ -36,7 +36,10 @@ def add_rock_bodies(
     rocks: RocksConfig,
     dynamics: DynamicsConfig,
 ) -> list[GeometryId]:
-    """Add one body per rock to `plant` (before Finalize); fixed rocks become geometry of the world.
+    """Add one body per rock to `plant` (before Finalize); all fixed rocks are on one that is welded to the world.
+
+    On the world's own body hundreds of them beside the floor, a half-space whose box has no bounds, make Drake read
+    stray memory (1.58: a segmentation fault when they are registered).
 
     Returns:
         The collision geometry of each rock.
@@ -46,13 +49,16 @@ def add_rock_bodies(
         (shape, size): _make_kind(shapes[shape], size, rocks, dynamics)
         for shape, size in sorted({(int(k), float(s)) for k, s in zip(pile.shape, pile.size, strict=True)})
     }
+    if pile.fixed.any():
+        solid = plant.AddRigidBody("fixed_rocks", instance, SpatialInertia.Zero())
+        plant.WeldFrames(plant.world_frame(), solid.body_frame())
     geometries = []
     for rock in range(len(pile)):
         inertia, convex, properties = kinds[int(pile.shape[rock]), float(pile.size[rock])]
         name = _name(rock)
         if pile.fixed[rock]:
             X_WR = make_pose(pile.q_WRs[rock], pile.p_WRs[rock])
-            body = plant.world_body()
+            body = solid
         else:
             X_WR = RigidTransform()
             body = plant.AddRigidBody(name, instance, inertia)
