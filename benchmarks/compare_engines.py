@@ -128,8 +128,9 @@ class Dig:
         self.simulator.Initialize()
 
     def go_on_from(self, other: Dig) -> None:
-        """Take over the time and the state of the machine of another dig, whose pile this one was made with."""
+        """Take over time and state of another dig of the same rocks."""
         self.root.SetTime(other.root.get_time())
+        self.rocks.set_pile(self.root, other.rocks.get_pile(other.root))
         of_machine = self.machine.instance, other.machine.instance
         self.plant.SetPositionsAndVelocities(
             self.plant_context,
@@ -196,11 +197,10 @@ def compare_states(arguments: argparse.Namespace) -> None:
     for seed in range(arguments.first, arguments.first + arguments.seeds):
         pile, depth = make_start(arguments.rocks, seed)
         dig = Dig(pile, variants[0], SMALL_SITE, depth)
+        others = [Dig(pile, variant, SMALL_SITE, depth) for variant in variants]
         for t in STATE_TIMES:
             dig.simulator.AdvanceTo(RELAXING + t)
-            state = dig.rocks.get_pile(dig.root)
-            for variant, pushes in zip(variants, found, strict=True):
-                other = Dig(state, variant, SMALL_SITE, depth)
+            for other, pushes in zip(others, found, strict=True):
                 other.go_on_from(dig)
                 push = np.array(list(other.advance(STATE_WINDOWS[-1]))) / 1e3
                 # Forces of steps of any length, as means over usual steps.
