@@ -3,28 +3,34 @@
     python benchmarks/compare_engines.py digs --rocks 300 --seeds 4 --points 1 --out build/engines.jsonl
     python benchmarks/compare_engines.py states --seeds 8 --variants nonsmooth,manifold_points=1 plant
 
-`digs`: each seed is one pile, filled and at rest in the nonsmooth engine, relaxed for a second in each engine with the
-machine standing, then dug with the same motor targets. Finished runs are skipped. `--points 1`: the nonsmooth engine
-with one contact point per pair, as the plant engine's point contact has it. `--against hydroelastic`: the plant engine
-with pressure fields over faces instead of single points, five times as dear. `--set damping_time=2`: another setting of
-the nonsmooth engine; give it an `--out` of its own. `--set linear_overlap=0.001 damping_time=0.75
-stiffness_factor=0.73 --dissipation 0` is one contact law in both: a spring of the same linear stiffness, as damped as
-an implicit Euler step makes it (the plant's usual Hunt-Crossley dissipation has no counterpart in the other).
-`--repeats 3`: each pile is dug three times in the nonsmooth engine, with one more iteration each, and their mean taken:
-digs are chaotic, these are cheap.
+`digs`: each seed is one pile, filled and at rest in the nonsmooth engine, relaxed for a second in each engine with
+the machine standing, then dug with the same motor targets. Finished runs are skipped, unless they were of another
+pile: that of a seed comes out otherwise on another processor. `--points 1`: the nonsmooth engine with one contact
+point per pair, as the plant engine's point contact has it. `--against hydroelastic`: the plant engine with pressure
+fields over faces instead of single points, five times as dear. `--set damping_time=2`: another setting of the
+nonsmooth engine; give it an `--out` of its own. `--repeats 3`: each pile is dug three times in the nonsmooth engine,
+with one more iteration each, and their mean taken: digs are chaotic, these are cheap.
+
+One contact law in both, of the same sharp rocks, is `--points 1 --dissipation 0 --set linear_overlap=0.001
+damping_time=1 stiffness_factor=0.73 impact_threshold=50 rounding=0.002`: a spring of the same linear stiffness, as
+damped as an implicit Euler step makes it, also for what comes near, and no rigid impacts. (The plant's usual
+Hunt-Crossley dissipation has no counterpart in the other.)
 
 `states` stops a dig of the first variant every half second; all variants go on from there for 0.3 s, and their pushes
 are compared. A variant is an engine with settings of its own, `time_step` and the plant's `dissipation` among them.
-That tells within minutes where engines, contact laws or time steps part, which whole digs hide in chaos.
+That tells within minutes where engines, contact laws or time steps part, which whole digs hide in chaos. Piles that are
+stored are skipped here, too.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -193,11 +199,15 @@ def compare_states(arguments: argparse.Namespace) -> None:
     common = parse_variant(",".join(["nonsmooth", *arguments.set])).nonsmooth
     variants = [replace(one, nonsmooth=common | one.nonsmooth) for one in arguments.variants]
     windows = [round(edge / TIME_STEP) for edge in STATE_WINDOWS]
-    found: list[list[list[float]]] = [[] for _ in variants]
-    for seed in range(arguments.first, arguments.first + arguments.seeds):
+    results = {(r["seed"], r["variant"]): r["push_kN"] for r in read_lines(arguments.out)}
+    seeds = range(arguments.first, arguments.first + arguments.seeds)
+    for seed in seeds:
+        if all((seed, variant.name) in results for variant in variants):
+            continue
         pile, depth = make_start(arguments.rocks, seed)
         dig = Dig(pile, variants[0], SMALL_SITE, depth)
         others = [Dig(pile, variant, SMALL_SITE, depth) for variant in variants]
+        found: list[list[list[float]]] = [[] for _ in variants]
         for t in STATE_TIMES:
             dig.simulator.AdvanceTo(RELAXING + t)
             for other, pushes in zip(others, found, strict=True):
@@ -205,49 +215,66 @@ def compare_states(arguments: argparse.Namespace) -> None:
                 push = np.array(list(other.advance(STATE_WINDOWS[-1]))) / 1e3
                 # Forces of steps of any length, as means over usual steps.
                 push = push.reshape(windows[-1], -1).mean(axis=1)
-                pushes.append([float(part.mean()) for part in np.split(push, windows[1:-1])])
-        print(f"pile {seed}: {len(found[0])} states", flush=True)
-        print_states(variants, found)
-
-
-def print_states(variants: list[Variant], found: list[list[list[float]]]) -> None:
-    base = np.array(found[0])
+                pushes.append([round(float(part.mean()), 3) for part in np.split(push, windows[1:-1])])
+        for variant, pushes in zip(variants, found, strict=True):
+            results[seed, variant.name] = pushes
+            add_line(arguments.out, {"seed": seed, "variant": variant.name, "push_kN": pushes})
+        print(f"pile {seed}", flush=True)
+    base = np.concatenate([results[seed, variants[0].name] for seed in seeds])
     pushed = base.mean(axis=1) > MIN_PUSH
-    if pushed.sum() < 2:
-        return
-    for variant, pushes in zip(variants, found, strict=True):
+    edges = [f"{low:g} to {high:g} s" for low, high in pairwise(STATE_WINDOWS)]
+    print(f"push [kN] of {pushed.sum()} states, and the difference (90 %): " + ", ".join(edges))
+    for variant in variants:
+        pushes = np.concatenate([results[seed, variant.name] for seed in seeds])
         cells = []
-        for a, b in zip(np.array(pushes)[pushed].T, base[pushed].T, strict=True):
+        for a, b in zip(pushes[pushed].T, base[pushed].T, strict=True):
             mean, half = compare(a, b)
-            cells.append(f"{a.mean():6.1f} ({100 * mean / b.mean():+5.1f} ± {100 * half / b.mean():4.1f} %)")
-        print(f"{', '.join(cells)}  {variant.name}", flush=True)
+            cells.append(f"{a.mean():.1f} ({100 * mean / b.mean():+.1f} ± {100 * half / b.mean():.1f} %)")
+        print(f"{variant.name}: " + ", ".join(cells))
+
+
+def read_lines(path: Path) -> list[dict]:
+    """Return the stored runs, if any; make room for more."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def add_line(path: Path, entry: dict[str, object]) -> None:
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(json.dumps(entry) + "\n")
 
 
 def compare_digs(arguments: argparse.Namespace) -> None:
     """Dig the piles in both engines, unless that is stored; print the differences."""
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
-    results = {(r["seed"], r["engine"], r.get("repeat", 0)): r for r in map(json.loads, lines)}
+    results = {(r["seed"], r["engine"], r.get("repeat", 0)): r for r in read_lines(arguments.out)}
     settings = parse_variant(",".join(["nonsmooth", *arguments.set])).nonsmooth
     iterations = settings.pop("iterations", float(NonsmoothConfig().iterations))
     ours = f"nonsmooth-{arguments.points}"
     digs = [(arguments.against, 0)] + [(ours, repeat) for repeat in range(arguments.repeats)]
     seeds = range(arguments.first, arguments.first + arguments.seeds)
     for seed in seeds:
-        todo = [dig for dig in digs if (seed, *dig) not in results]
-        if not todo:
+        if all((seed, *dig) in results for dig in digs):
             continue
         pile, depth = make_start(arguments.rocks, seed)
-        for engine, repeat in todo:
+        mark = hashlib.sha256(pile.p_WRs.tobytes()).hexdigest()[:12]
+        for engine, repeat in digs:
+            if results.get((seed, engine, repeat), {}).get("pile") == mark:
+                continue
             own = {"manifold_points": float(arguments.points), "iterations": iterations + repeat}
             variant = Variant(
                 "nonsmooth" if engine == ours else engine, settings | own, arguments.dissipation
             )
             result = run(pile, variant, SMALL_SITE, depth, arguments.duration)
             results[seed, engine, repeat] = result
-            entry = {"seed": seed, "engine": engine, "repeat": repeat, "rocks": len(pile), **result}
-            with open(arguments.out, "a", encoding="utf-8") as file:
-                file.write(json.dumps(entry) + "\n")
+            entry = {
+                "seed": seed,
+                "engine": engine,
+                "repeat": repeat,
+                "pile": mark,
+                "rocks": len(pile),
+                **result,
+            }
+            add_line(arguments.out, entry)
             print(seed, engine, repeat, len(pile), {k: round(v, 2) for k, v in result.items()}, flush=True)
     for metric in (*METRICS, "cpu_s"):
         a, b = (
@@ -266,8 +293,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(required=True)
     digs, states = commands.add_parser("digs"), commands.add_parser("states")
-    for command, work in ((digs, compare_digs), (states, compare_states)):
+    for command, work, name in ((digs, compare_digs, "engines"), (states, compare_states, "engine-states")):
         command.set_defaults(work=work)
+        command.add_argument("--out", type=Path, default=Path(f"build/{name}.jsonl"))
         command.add_argument("--rocks", type=int, default=300)
         command.add_argument("--seeds", type=int, default=4)
         command.add_argument("--first", type=int, default=0)
@@ -281,7 +309,6 @@ def main() -> None:
         "--dissipation", type=float, default=PlantEngineConfig().dissipation, help="of the plant's"
     )
     digs.add_argument("--repeats", type=int, default=1, help="digs of a pile in the nonsmooth engine")
-    digs.add_argument("--out", type=Path, default=Path("build/engines.jsonl"))
     states.add_argument(
         "--variants", nargs="+", type=parse_variant, required=True, metavar="ENGINE[,KEY=VALUE]..."
     )
