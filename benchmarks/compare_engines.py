@@ -221,16 +221,21 @@ def compare_states(arguments: argparse.Namespace) -> None:
             add_line(arguments.out, {"seed": seed, "variant": variant.name, "push_kN": pushes})
         print(f"pile {seed}", flush=True)
     base = np.concatenate([results[seed, variants[0].name] for seed in seeds])
-    pushed = base.mean(axis=1) > MIN_PUSH
-    edges = [f"{low:g} to {high:g} s" for low, high in pairwise(STATE_WINDOWS)]
+    pushed = np.average(base, axis=1, weights=np.diff(STATE_WINDOWS)) > MIN_PUSH
+    edges = [f"{low:g} to {high:g} s" for low, high in pairwise(STATE_WINDOWS)] + ["all"]
     print(f"push [kN] of {pushed.sum()} states, and the difference (90 %): " + ", ".join(edges))
     for variant in variants:
         pushes = np.concatenate([results[seed, variant.name] for seed in seeds])
         cells = []
-        for a, b in zip(pushes[pushed].T, base[pushed].T, strict=True):
+        for a, b in zip(*(_append_mean(one[pushed]).T for one in (pushes, base)), strict=True):
             mean, half = compare(a, b)
             cells.append(f"{a.mean():.1f} ({100 * mean / b.mean():+.1f} ± {100 * half / b.mean():.1f} %)")
         print(f"{variant.name}: " + ", ".join(cells))
+
+
+def _append_mean(pushes: np.ndarray) -> np.ndarray:
+    """Return the pushes in the windows (states, windows), and last their mean over the whole time."""
+    return np.column_stack([pushes, np.average(pushes, axis=1, weights=np.diff(STATE_WINDOWS))])
 
 
 def read_lines(path: Path) -> list[dict]:
