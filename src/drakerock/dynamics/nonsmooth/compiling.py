@@ -123,7 +123,7 @@ def are_kernels_compiled() -> bool:
 
 def describe_compilation() -> str:
     """Return what is said before the kernels are compiled."""
-    return f"compiling the rock engine's kernels into {find_cache_folder()} (once, below a minute)"
+    return f"compiling the rock engine's kernels into {find_cache_folder()} (once, a minute or two)"
 
 
 @lru_cache(maxsize=1)
