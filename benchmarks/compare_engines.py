@@ -37,7 +37,7 @@ import numpy as np
 from faithfulness import SIZES, compare, make_small_pile
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from rocks import ROCKS, SHAPES, TIME_STEP, Motors, clear_way, make_dig
+from rocks import ROCKS, SHAPES, TIME_STEP, Motors, calc_bucket_mass, clear_way, make_dig
 
 from drakerock.dynamics.assembly import add_plant, add_site
 from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig, PlantEngineConfig
@@ -46,7 +46,6 @@ from drakerock.dynamics.plant.rocks import add_plant_rocks, add_rock_bodies
 from drakerock.machine.config import MachineConfig
 from drakerock.machine.model import add_machine, calc_motor_targets
 from drakerock.machine.placement import set_machine_pose
-from drakerock.pile.config import SiteConfig
 from drakerock.pile.site import make_site
 from drakerock.pile.state import PileState
 
@@ -69,12 +68,18 @@ class Variant:
     name: str = ""
 
 
+def parse_setting(text: str) -> tuple[str, float]:
+    """Return key and value of a text such as `damping_time=2`."""
+    key, value = text.split("=")
+    return key, float(value)
+
+
 def parse_variant(text: str) -> Variant:
     """Return the variant of a text such as `nonsmooth,manifold_points=1,time_step=0.005`."""
     engine, *items = text.split(",")
     if engine not in ("nonsmooth", "plant", "hydroelastic"):
         raise argparse.ArgumentTypeError(f"{engine}: one of nonsmooth, plant, hydroelastic")
-    settings = {key: float(value) for key, value in (item.split("=") for item in items)}
+    settings = dict(map(parse_setting, items))
     general = {key: settings.pop(key) for key in ("dissipation", "time_step") if key in settings}
     return Variant(engine, settings, **general, name=text)
 
@@ -85,11 +90,10 @@ class Dig:
     Args:
         pile: the rocks.
         variant: what moves them.
-        site: where.
         depth: of the dig [m].
     """
 
-    def __init__(self, pile: PileState, variant: Variant, site: SiteConfig, depth: float) -> None:
+    def __init__(self, pile: PileState, variant: Variant, depth: float) -> None:
         dynamics = DynamicsConfig(
             rocks="nonsmooth" if variant.engine == "nonsmooth" else "plant",
             nonsmooth=NonsmoothConfig(reduction="none", **variant.nonsmooth),
@@ -101,7 +105,7 @@ class Dig:
         )
         builder = DiagramBuilder()
         self.plant, scene_graph = add_plant(builder, dynamics)
-        built = make_site(site)
+        built = make_site(SMALL_SITE)
         add_site(self.plant, built, dynamics)
         self.machine = add_machine(self.plant, MachineConfig())
         inputs = []
@@ -158,10 +162,8 @@ class Dig:
         return float(self.plant.GetFrameByName("tip").CalcPoseInWorld(self.plant_context).translation()[0])
 
 
-def run(
-    pile: PileState, variant: Variant, site: SiteConfig, depth: float, duration: float
-) -> dict[str, float]:
-    dig = Dig(pile, variant, site, depth)
+def run(pile: PileState, variant: Variant, depth: float, duration: float) -> dict[str, float]:
+    dig = Dig(pile, variant, depth)
     start = dig.get_reach()
     dig.simulator.AdvanceTo(RELAXING)
     before = dig.rocks.get_pile(dig.root).p_WRs
@@ -171,17 +173,15 @@ def run(
         push.append(force)
         reach.append(dig.get_reach() - start)
     cpu = time.process_time() - cpu
-    after = dig.rocks.get_pile(dig.root).p_WRs
-    X_WB = dig.plant.EvalBodyPoseInWorld(dig.plant_context, dig.plant.GetBodyByName("bucket"))
-    local = (after - X_WB.translation()) @ X_WB.rotation().matrix()
-    inside = (np.abs(local - [0.95, 0.0, 0.9]) < [1.15, 1.5, 1.4]).all(axis=1)
+    after = dig.rocks.get_pile(dig.root)
+    moved = np.linalg.norm(after.p_WRs - before, axis=1) > 0.05
     masses = pile.calc_masses(np.array([shape.volume for shape in SHAPES]), ROCKS.density)
     smooth = np.convolve(push, np.full(10, 0.1), mode="valid")
     return {
-        "bucket_mass_kg": float(masses[inside].sum()),
+        "bucket_mass_kg": calc_bucket_mass(after, masses, dig.plant, dig.plant_context),
         "peak_push_kN": float(smooth.max()) / 1e3,
         "mean_push_kN": float(np.clip(push[:600], 0.0, None).mean()) / 1e3,
-        "displaced_m3": float(masses[np.linalg.norm(after - before, axis=1) > 0.05].sum() / ROCKS.density),
+        "displaced_m3": float(masses[moved].sum() / ROCKS.density),
         "reach_m": float(np.max(reach)),
         "cpu_s": cpu,
     }
@@ -196,8 +196,7 @@ def make_start(rocks: int, seed: int) -> tuple[PileState, float]:
 
 def compare_states(arguments: argparse.Namespace) -> None:
     """Go on from the states of digs of the first variant with each of them; print their pushes."""
-    common = parse_variant(",".join(["nonsmooth", *arguments.set])).nonsmooth
-    variants = [replace(one, nonsmooth=common | one.nonsmooth) for one in arguments.variants]
+    variants = [replace(one, nonsmooth=dict(arguments.set) | one.nonsmooth) for one in arguments.variants]
     windows = [round(edge / TIME_STEP) for edge in STATE_WINDOWS]
     results = {(r["seed"], r["variant"]): r["push_kN"] for r in read_lines(arguments.out)}
     seeds = range(arguments.first, arguments.first + arguments.seeds)
@@ -205,8 +204,8 @@ def compare_states(arguments: argparse.Namespace) -> None:
         if all((seed, variant.name) in results for variant in variants):
             continue
         pile, depth = make_start(arguments.rocks, seed)
-        dig = Dig(pile, variants[0], SMALL_SITE, depth)
-        others = [Dig(pile, variant, SMALL_SITE, depth) for variant in variants]
+        dig = Dig(pile, variants[0], depth)
+        others = [Dig(pile, variant, depth) for variant in variants]
         found: list[list[list[float]]] = [[] for _ in variants]
         for t in STATE_TIMES:
             dig.simulator.AdvanceTo(RELAXING + t)
@@ -251,8 +250,8 @@ def add_line(path: Path, entry: dict[str, object]) -> None:
 
 def compare_digs(arguments: argparse.Namespace) -> None:
     """Dig the piles in both engines, unless that is stored; print the differences."""
-    results = {(r["seed"], r["engine"], r.get("repeat", 0)): r for r in read_lines(arguments.out)}
-    settings = parse_variant(",".join(["nonsmooth", *arguments.set])).nonsmooth
+    results = {(r["seed"], r["engine"], r["repeat"]): r for r in read_lines(arguments.out)}
+    settings = dict(arguments.set)
     iterations = settings.pop("iterations", float(NonsmoothConfig().iterations))
     ours = f"nonsmooth-{arguments.points}"
     digs = [(arguments.against, 0)] + [(ours, repeat) for repeat in range(arguments.repeats)]
@@ -269,7 +268,7 @@ def compare_digs(arguments: argparse.Namespace) -> None:
             variant = Variant(
                 "nonsmooth" if engine == ours else engine, settings | own, arguments.dissipation
             )
-            result = run(pile, variant, SMALL_SITE, depth, arguments.duration)
+            result = run(pile, variant, depth, arguments.duration)
             results[seed, engine, repeat] = result
             entry = {
                 "seed": seed,
@@ -305,7 +304,12 @@ def main() -> None:
         command.add_argument("--seeds", type=int, default=4)
         command.add_argument("--first", type=int, default=0)
         command.add_argument(
-            "--set", nargs="*", default=[], metavar="KEY=VALUE", help="of the nonsmooth engine"
+            "--set",
+            nargs="*",
+            type=parse_setting,
+            default=[],
+            metavar="KEY=VALUE",
+            help="of the nonsmooth engine",
         )
     digs.add_argument("--points", type=int, choices=range(1, 5), default=4)
     digs.add_argument("--duration", type=float, default=10.0)
