@@ -17,6 +17,7 @@ from typing import Any
 
 import numba
 import platformdirs
+from numba import types
 from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import NDArray
 
@@ -63,12 +64,17 @@ def _compile[Function: Callable[..., Any]](function: Function, counts_arrays: bo
     numba.config.CACHE_DIR = str(find_cache_folder())
     try:
         decorated: Function = numba.njit(
-            cache=True, error_model="numpy", _nrt=counts_arrays, forceinline=not counts_arrays
+            cache=True,
+            error_model="numpy",
+            _nrt=counts_arrays,
+            forceinline=not counts_arrays,
+            no_cfunc_wrapper=True,  # nothing in C calls them
         )(function)
     finally:
         numba.config.CACHE_DIR = before
     if not numba.config.DISABLE_JIT:
         _compile_alone(decorated)
+        _compile_once(decorated)
     return decorated
 
 
@@ -116,6 +122,20 @@ def _compile_alone(dispatcher: Any) -> None:
     dispatcher.compile = compile_alone
 
 
+def _compile_once(dispatcher: Any) -> None:
+    """Make kernels that are called with a constant the same as with any number: numba compiles one for each constant.
+
+    Nothing is lost: kernels are inlined, constants and all.
+    """
+    find_template = dispatcher.get_call_template
+
+    def find_without_constants(args: tuple[Any, ...], kws: dict[str, Any]) -> Any:
+        plain = {name: types.unliteral(type_) for name, type_ in kws.items()}
+        return find_template(tuple(types.unliteral(type_) for type_ in args), plain)
+
+    dispatcher.get_call_template = find_without_constants
+
+
 def are_kernels_compiled() -> bool:
     """Return whether kernels have been compiled into the folder before; all of them, unless that was cut short."""
     return any(find_cache_folder().rglob("*.nbc"))
@@ -123,7 +143,7 @@ def are_kernels_compiled() -> bool:
 
 def describe_compilation() -> str:
     """Return what is said before the kernels are compiled."""
-    return f"compiling the rock engine's kernels into {find_cache_folder()} (once, a minute or two)"
+    return f"compiling the rock engine's kernels into {find_cache_folder()} (once, about a minute)"
 
 
 @lru_cache(maxsize=1)

@@ -146,10 +146,18 @@ def split_key(key: int) -> tuple[int, int]:
     return key // KEY_STEP, key % KEY_STEP
 
 
+# What is read from memory is as wide as elsewhere: kernels are compiled once for each type of number they are given.
+@kernel
+def read_pair(memory: Memory, row: int) -> tuple[int, int]:
+    """Return the two bodies that a row of the memory belongs to."""
+    return int(np.int64(memory.pairs[row, 0])), int(np.int64(memory.pairs[row, 1]))
+
+
 @kernel
 def read_key(memory: Memory, row: int) -> int:
     """Return the key of the pair that a row of the memory belongs to."""
-    return make_key(int(memory.pairs[row, 0]), int(memory.pairs[row, 1]))
+    a, b = read_pair(memory, row)
+    return make_key(a, b)
 
 
 @kernel
@@ -161,20 +169,20 @@ def read_simplex(memory: Memory, row: int) -> int:
 
 
 @kernel
-def read_impulse(memory: Memory, row: int) -> Vector:
-    """Return the impulse of a row of the memory, in W [N s]."""
+def read_vector(memory: Memory, row: int, column: int) -> Vector:
+    """Return the three numbers of a row of the memory that begin at a column."""
     values = memory.values
     return (
-        float(values[row, MEMORY_IMPULSE]),
-        float(values[row, MEMORY_IMPULSE + 1]),
-        float(values[row, MEMORY_IMPULSE + 2]),
+        np.float64(values[row, column]),
+        np.float64(values[row, column + 1]),
+        np.float64(values[row, column + 2]),
     )
 
 
 @kernel
 def is_loaded(memory: Memory, row: int) -> bool:
     """Return whether a row of the memory carried load; the others are about to touch."""
-    x, y, z = read_impulse(memory, row)
+    x, y, z = read_vector(memory, row, MEMORY_IMPULSE)
     return bool(x != 0.0 or y != 0.0 or z != 0.0)
 
 

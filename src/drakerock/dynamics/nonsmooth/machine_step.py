@@ -1,4 +1,7 @@
-"""The machine over a step as the contact solve sees it: inertia, closed loops and rows (see `coupling`)."""
+"""The machine over a step as the contact solve sees it: inertia, closed loops and rows (see `coupling`).
+
+Products of whole matrices are numpy's: a few of them take no time in a step, but seconds each to compile.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drakerock.dynamics.nonsmooth.collision.geometry import make_tangents
-from drakerock.dynamics.nonsmooth.compiling import Array, allocating_kernel, kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, kernel
 from drakerock.dynamics.nonsmooth.solver import (
     LOWER,
     MACHINE_ROW_WIDTH,
@@ -40,7 +43,6 @@ SITE_WIDTH = 10
 LOOP_COMPLIANCE = 1e-10
 
 
-@allocating_kernel
 def calc_free_motion(
     inertia: Array, impulse: Array, velocity: Array, loop_rows: Array
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -56,17 +58,14 @@ def calc_free_motion(
     free_change = inverse @ impulse
     if len(loop_rows) == 0:
         return inverse, free_change
-    response = np.ascontiguousarray(inverse @ loop_rows.T)
+    response = inverse @ loop_rows.T
     mobility = loop_rows @ response
     # A plane linkage has rows that say nothing: with a little compliance they have a solution, too.
-    compliance = LOOP_COMPLIANCE * np.trace(mobility)
-    for k in range(len(loop_rows)):
-        mobility[k, k] += compliance
-    hold = np.ascontiguousarray(np.linalg.solve(mobility, response.T).T)
+    mobility[np.diag_indices_from(mobility)] += LOOP_COMPLIANCE * np.trace(mobility)
+    hold = np.linalg.solve(mobility, response.T).T
     return inverse - hold @ response.T, free_change - hold @ (loop_rows @ (velocity + free_change))
 
 
-@allocating_kernel
 def make_machine_arrays(
     inverse: Array,
     jacobian: Array,
@@ -87,10 +86,29 @@ def make_machine_arrays(
         stiction_tolerance: slip at which friction is full [m/s].
         time_step: [s].
     """
-    n_joints, n_v = len(joints), len(inverse)
-    n_rows = n_joints + 3 * len(contacts)
-    rows, values = np.zeros((n_rows, n_v)), np.zeros((n_rows, MACHINE_ROW_WIDTH))
+    n_rows = len(joints) + 3 * len(contacts)
+    rows, values = np.zeros((n_rows, len(inverse))), np.zeros((n_rows, MACHINE_ROW_WIDTH))
     values[:, NORMAL_ROW] = -1.0
+    _set_rows(joints, contacts, jacobian, origins, stiction_tolerance, time_step, rows, values)
+    row_response = rows @ inverse
+    values[:, ROW_MASS] = 1.0 / (np.einsum("rv,rv->r", rows, row_response) + values[:, ROW_COMPLIANCE])
+    response = inverse @ jacobian.transpose(0, 2, 1)
+    return MachineArrays(jacobian, response, jacobian @ response, rows, row_response, values)
+
+
+@kernel
+def _set_rows(
+    joints: Array,
+    contacts: Array,
+    jacobian: Array,
+    origins: Array,
+    stiction_tolerance: float,
+    time_step: float,
+    rows: Array,
+    values: Array,
+) -> None:
+    """Set all rows but for what follows from inertia."""
+    n_joints = len(joints)
     for k in range(n_joints):
         rows[k, int(joints[k, JOINT_VELOCITY])] = joints[k, JOINT_SIDE]
         values[k, TARGET], values[k, ROW_COMPLIANCE] = joints[k, JOINT_TARGET], joints[k, JOINT_COMPLIANCE]
@@ -99,15 +117,6 @@ def make_machine_arrays(
         _set_site_rows(
             contacts[c], jacobian, origins, n_joints + 3 * c, stiction_tolerance, time_step, rows, values
         )
-    row_response = rows @ inverse
-    for k in range(n_rows):
-        values[k, ROW_MASS] = 1.0 / (np.dot(rows[k], row_response[k]) + values[k, ROW_COMPLIANCE])
-    n_bodies = len(jacobian)
-    response, mobility = np.empty((n_bodies, n_v, 6)), np.empty((n_bodies, 6, 6))
-    for b in range(n_bodies):
-        response[b] = inverse @ jacobian[b].T
-        mobility[b] = jacobian[b] @ response[b]
-    return MachineArrays(jacobian, response, mobility, rows, row_response, values)
 
 
 @kernel

@@ -12,7 +12,7 @@ import numpy as np
 
 from drakerock.dynamics.nonsmooth.collision.geometry import find_support, get_corner, rotate_back
 from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
-from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, Vector, allocating_kernel, kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, Vector, kernel
 
 SEPARATED, NEAR, OVERLAPPING = 1, 0, -1
 MAX_ITERATIONS = 32
@@ -23,7 +23,6 @@ MAX_CORNER = 1 << CORNER_BITS
 Workspace = tuple[Array, Array, Array, Array]
 
 
-@allocating_kernel
 def make_gjk_workspace() -> Workspace:
     """Return (points, on_a, weights, corners).
 

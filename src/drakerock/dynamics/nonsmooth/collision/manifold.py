@@ -15,7 +15,7 @@ import numpy as np
 
 from drakerock.dynamics.nonsmooth.collision.geometry import get_corner, rotate, rotate_back
 from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
-from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, allocating_kernel, kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, kernel
 
 MAX_OUTLINE = 96
 MAX_POINTS = 4
@@ -30,7 +30,6 @@ KNOWN = 4
 CANDIDATE_WIDTH = 5
 
 
-@allocating_kernel
 def make_manifold_workspace() -> tuple[Array, Array, Array, Array]:
     """Return (corners, outline, clipped, candidates), all of MAX_OUTLINE rows."""
     return (

@@ -34,7 +34,7 @@ from drakerock.dynamics.nonsmooth.collision.manifold import (
 )
 from drakerock.dynamics.nonsmooth.collision.overlap import calc_core_penetration
 from drakerock.dynamics.nonsmooth.collision.shapes import ConvexShapes
-from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, allocating_kernel, kernel
+from drakerock.dynamics.nonsmooth.compiling import Array, Rotation, kernel
 from drakerock.dynamics.nonsmooth.contacts import (
     ARM_A,
     ARM_B,
@@ -42,6 +42,7 @@ from drakerock.dynamics.nonsmooth.contacts import (
     GAP,
     IMPULSE,
     MEMORY_GAP,
+    MEMORY_IMPULSE,
     MEMORY_NORMAL,
     MEMORY_POINT,
     NORMAL,
@@ -58,9 +59,10 @@ from drakerock.dynamics.nonsmooth.contacts import (
     make_key,
     prefetch_places,
     prefetch_remembered,
-    read_impulse,
     read_key,
+    read_pair,
     read_simplex,
+    read_vector,
     store_axis,
 )
 from drakerock.dynamics.nonsmooth.prefetching import AHEAD, prefetch
@@ -94,7 +96,6 @@ class CollisionBodies(NamedTuple):
     friction: NDArray[np.float64]
 
 
-@allocating_kernel
 def make_workspace() -> Workspace:
     """Return scratch memory of the narrow phase: distances, manifolds, a pair's points, those of the last step."""
     return (
@@ -231,14 +232,14 @@ def _follow_row(
     order in the pair's own motion, fractions of a millimetre.
     """
     if n_rows < len(rows.values):
-        a, b = int(memory.pairs[row, 0]), int(memory.pairs[row, 1])
-        values = memory.values[row]
+        a, b = read_pair(memory, row)
         r_a = get_rotation(bodies.rotations, a)
-        point = rotate(r_a, values[MEMORY_POINT], values[MEMORY_POINT + 1], values[MEMORY_POINT + 2])
-        normal = rotate(r_a, values[MEMORY_NORMAL], values[MEMORY_NORMAL + 1], values[MEMORY_NORMAL + 2])
+        x, y, z = read_vector(memory, row, MEMORY_POINT)
+        nx, ny, nz = read_vector(memory, row, MEMORY_NORMAL)
         _write_row(
-            rows, n_rows, bodies, a, b, normal, point, float(values[MEMORY_GAP]), read_impulse(memory, row),
-            restitution[0], read_simplex(memory, row),
+            rows, n_rows, bodies, a, b, rotate(r_a, nx, ny, nz), rotate(r_a, x, y, z),
+            np.float64(memory.values[row, MEMORY_GAP]), read_vector(memory, row, MEMORY_IMPULSE), restitution[0],
+            read_simplex(memory, row),
         )  # fmt: skip
     return n_rows + 1
 
@@ -480,14 +481,12 @@ def find_contacts(
         if first_row >= 0:
             row = first_row
             while row < len(memory.pairs) and read_key(memory, row) == key:
-                ix, iy, iz = read_impulse(memory, row)
+                ix, iy, iz = read_vector(memory, row, MEMORY_IMPULSE)
                 hx, hy, hz = hx + ix, hy + iy, hz + iz
                 if n_known < MAX_POINTS and is_loaded(memory, row):
+                    x, y, z = read_vector(memory, row, MEMORY_POINT)
                     known_points[n_known, 0], known_points[n_known, 1], known_points[n_known, 2] = rotate(
-                        r_a,
-                        memory.values[row, MEMORY_POINT],
-                        memory.values[row, MEMORY_POINT + 1],
-                        memory.values[row, MEMORY_POINT + 2],
+                        r_a, x, y, z
                     )
                     n_known += 1
                 row += 1
@@ -515,7 +514,9 @@ def find_contacts(
                 positions[b, 1] - positions[a, 1],
                 positions[b, 2] - positions[a, 2],
             )
-            gx, gy, gz = float(known_axes[pair, 0]), float(known_axes[pair, 1]), float(known_axes[pair, 2])
+            gx: float = np.float64(known_axes[pair, 0])
+            gy: float = np.float64(known_axes[pair, 1])
+            gz: float = np.float64(known_axes[pair, 2])
             if gx != 0.0 or gy != 0.0 or gz != 0.0:
                 along = (
                     gx * px
@@ -577,18 +578,15 @@ def find_contacts(
                 found = -1
                 row = first_row
                 while row < len(memory.pairs) and read_key(memory, row) == key:
-                    distance2 = (
-                        (memory.values[row, MEMORY_POINT] - lx) ** 2
-                        + (memory.values[row, MEMORY_POINT + 1] - ly) ** 2
-                        + (memory.values[row, MEMORY_POINT + 2] - lz) ** 2
-                    )
+                    mx, my, mz = read_vector(memory, row, MEMORY_POINT)
+                    distance2 = (mx - lx) ** 2 + (my - ly) ** 2 + (mz - lz) ** 2
                     if distance2 < nearest and (used >> (row - first_row)) & 1 == 0:
                         nearest = distance2
                         found = row
                     row += 1
                 if found >= 0:
                     used |= 1 << (found - first_row)
-                    ix, iy, iz = read_impulse(memory, found)
+                    ix, iy, iz = read_vector(memory, found, MEMORY_IMPULSE)
             _write_row(
                 rows, n_rows, bodies, a, b, (nx, ny, nz), (x, y, z), points[k, 3], (ix, iy, iz),
                 restitution[1] if body_2 > n_rocks else restitution[0], simplex,
