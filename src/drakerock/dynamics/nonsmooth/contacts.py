@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drakerock.dynamics.nonsmooth.collision.broad_phase import AWAKE, LOST
 from drakerock.dynamics.nonsmooth.compiling import Array, Vector, kernel
 from drakerock.dynamics.nonsmooth.lanes import make_zeros
 from drakerock.dynamics.nonsmooth.prefetching import prefetch
@@ -188,7 +189,7 @@ def is_loaded(memory: Memory, row: int) -> bool:
 
 @kernel
 def _is_active(status: int) -> bool:
-    return status == 0 or status == 3
+    return status == AWAKE or status == LOST  # `in` would be a loop
 
 
 @kernel
