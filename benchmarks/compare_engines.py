@@ -12,9 +12,9 @@ nonsmooth engine; give it an `--out` of its own. `--repeats 3`: each pile is dug
 with one more iteration each, and their mean taken: digs are chaotic, these are cheap.
 
 One contact law in both, of the same sharp rocks, is `--points 1 --dissipation 0 --set linear_overlap=0.001
-damping_time=1 stiffness_factor=0.73 impact_threshold=50 rounding=0.002`: a spring of the same linear stiffness, as
-damped as an implicit Euler step makes it, also for what comes near, and no rigid impacts. (The plant's usual
-Hunt-Crossley dissipation has no counterpart in the other.)
+damping_time=1 impact_threshold=50 rounding=0.002`: the plant's springs, as damped as an implicit Euler step makes them,
+also for what comes near, and no rigid impacts. (The plant's usual Hunt-Crossley dissipation has no counterpart in the
+other; what the machine's steel has of it remains, a tenth beside soft rocks.)
 
 `states` stops a dig of the first variant every half second; all variants go on from there for 0.3 s, and their pushes
 are compared. A variant is an engine with settings of its own, `time_step` and the plant's `dissipation` among them.

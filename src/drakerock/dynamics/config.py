@@ -75,15 +75,15 @@ class NonsmoothConfig(Config):
         float,
         Field(
             gt=0,
-            description="on Hertz's stiffness of balls whose radii are the sieve widths, by modulus and Poisson ratio",
+            description="on Hertz's stiffness by modulus and Poisson ratio, of balls whose radii are the sieve widths",
         ),
     ] = 1.0
     linear_overlap: Annotated[
         float,
         Field(
             ge=0,
-            description="0: Hertz's law, and what comes near is met rigidly; above: linear, with Hertz's force at this "
-            "overlap, also for what comes near, as in the plant engine [m]",
+            description="0: Hertz's law, and what comes near is met rigidly; above: the plant engine's linear law, "
+            "with Hertz's force at this overlap, also for what comes near [m]",
         ),
     ] = 0.0
     spin_damping: Annotated[

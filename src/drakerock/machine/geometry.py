@@ -25,6 +25,9 @@ from drakerock.machine.model import Machine
 
 Array = np.ndarray
 
+# Of what has no ``drake:point_contact_stiffness`` [N/m].
+POINT_STIFFNESS = 1e8
+
 
 @dataclass(frozen=True)
 class BucketGeometry:
@@ -47,10 +50,17 @@ class BucketGeometry:
 
 @dataclass(frozen=True)
 class CollisionPiece:
-    """A convex piece of a body: `vertices` (k, 3) in the body's frame [m], and its Coulomb friction `mu`."""
+    """A convex piece of a body.
+
+    Attributes:
+        vertices: (k, 3) in the body's frame [m].
+        mu: its Coulomb friction.
+        stiffness: of its point contacts, in series with the other body's [N/m].
+    """
 
     vertices: Array
     mu: float
+    stiffness: float
 
 
 def make_bucket_geometry(plant: MultibodyPlant, scene_graph: SceneGraph, machine: Machine) -> BucketGeometry:
@@ -108,12 +118,14 @@ def collision_pieces(
                 continue
             X_BG = inspector.GetPoseInFrame(geometry)
             vertices = _make_vertices(inspector, geometry)
-            friction: CoulombFriction = inspector.GetProximityProperties(geometry).GetProperty(
-                "material", "coulomb_friction"
-            )  # type: ignore[assignment]
+            properties = inspector.GetProximityProperties(geometry)
+            friction: CoulombFriction = properties.GetProperty("material", "coulomb_friction")  # type: ignore[assignment]
             piece = CollisionPiece(
                 (X_BG.rotation().matrix() @ vertices.T).T + X_BG.translation(),
                 float(friction.dynamic_friction()),
+                float(
+                    properties.GetPropertyOrDefault("material", "point_contact_stiffness", POINT_STIFFNESS)
+                ),
             )
             pieces.setdefault(body.name(), []).append(piece)
     return pieces

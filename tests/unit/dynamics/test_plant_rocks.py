@@ -6,10 +6,11 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drakerock.dynamics.assembly import add_plant, add_site
-from drakerock.dynamics.config import DynamicsConfig
+from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
 from drakerock.dynamics.contact_graph import find_contacts, find_loose
 from drakerock.dynamics.interface import ROCK_SUMMARY
 from drakerock.dynamics.materials import calc_contact_stiffness, calc_pair_friction
+from drakerock.dynamics.nonsmooth.coupling import make_machine_layout
 from drakerock.dynamics.plant.rocks import add_plant_rocks, add_rock_bodies
 from drakerock.machine.config import MachineConfig
 from drakerock.machine.geometry import collision_pieces
@@ -17,6 +18,7 @@ from drakerock.machine.model import add_machine
 from drakerock.pile.config import RocksConfig, SiteConfig
 from drakerock.pile.site import make_site
 from drakerock.pile.state import make_empty_pile
+from rock_helpers import make_engine
 
 
 def build(pile, shapes):
@@ -155,3 +157,29 @@ def test_walls_hold_rocks_in(heap, shapes):
     for plane in site.planes:
         assert (after.p_WRs @ plane.normal > plane.offset).all()
     assert (np.linalg.norm(after.V_WRs[:, 3:], axis=1) < 5.0).all()
+
+
+def test_the_nonsmooth_engines_linear_law_has_the_plants_springs(heap, shapes):
+    builder = DiagramBuilder()
+    dynamics = DynamicsConfig(nonsmooth=NonsmoothConfig(linear_overlap=DynamicsConfig().reference_overlap))
+    plant, scene_graph = add_plant(builder, dynamics)
+    machine = add_machine(plant, MachineConfig())
+    geometries = add_rock_bodies(plant, heap, shapes, RocksConfig(), dynamics)
+    plant.Finalize()
+    layout = make_machine_layout(plant, scene_graph, machine, 2.0, 0.3)
+    engine = make_engine(
+        heap, shapes, config=dynamics.nonsmooth, pieces=layout.pieces, n_machine_bodies=len(layout.bodies)
+    )
+    inspector = scene_graph.model_inspector()
+
+    def get_softness(geometry):
+        return 1.0 / inspector.GetProximityProperties(geometry).GetProperty(
+            "material", "point_contact_stiffness"
+        )
+
+    rocks, still, bodies = np.split(engine.softness, [len(heap), len(heap) + 1])
+    assert rocks == pytest.approx([get_softness(geometry) for geometry in geometries])
+    assert still == 0.0
+    for softness, name in zip(bodies, layout.bodies, strict=True):
+        body = plant.GetBodyByName(name, machine.instance)
+        assert softness == get_softness(plant.GetCollisionGeometriesForBody(body)[0])

@@ -32,7 +32,7 @@ from drakerock.dynamics.nonsmooth.machine_step import (
     calc_free_motion,
     make_machine_arrays,
 )
-from drakerock.machine.geometry import collision_pieces
+from drakerock.machine.geometry import POINT_STIFFNESS, collision_pieces
 from drakerock.machine.model import Machine
 
 Array = NDArray[np.float64]
@@ -75,7 +75,7 @@ def make_machine_layout(
     by_body = collision_pieces(plant, scene_graph, machine)
     bodies = tuple(by_body)
     pieces = tuple(
-        MachinePiece(number, np.asarray(piece.vertices, float), piece.mu)
+        MachinePiece(number, np.asarray(piece.vertices, float), piece.mu, piece.stiffness)
         for number, name in enumerate(bodies)
         for piece in by_body[name]
     )
@@ -245,7 +245,7 @@ class MachineView(LeafSystem):
             properties = inspector.GetProximityProperties(geometry)
             self._materials[geometry] = (
                 self._body_number.get(int(body.index())),
-                properties.GetPropertyOrDefault("material", "point_contact_stiffness", 1e8),
+                properties.GetPropertyOrDefault("material", "point_contact_stiffness", POINT_STIFFNESS),
                 properties.GetProperty("material", "coulomb_friction").dynamic_friction(),
             )
         return self._materials[geometry]

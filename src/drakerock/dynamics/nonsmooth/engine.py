@@ -56,11 +56,13 @@ class MachinePiece:
         body: number of the body among the machine's bodies that touch rocks.
         vertices: (k, 3) in the body's frame [m].
         friction: its coefficient; a pair has 2 a b / (a + b).
+        stiffness: of the linear law [N/m], see `NonsmoothConfig.linear_overlap`; the same for all pieces of a body.
     """
 
     body: int
     vertices: Array
     friction: float
+    stiffness: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,10 +251,17 @@ class NonsmoothEngine:
         inverse = inertia[self.shape_index] / (rocks.density * self.size**5)[:, None, None]
         self.inverse_inertia_local = np.ascontiguousarray(inverse.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
         self.radius = self.size * self.convex.radius[self.shape_index]
-        self.curvature = np.zeros(n + 1 + n_machine_bodies)
-        self.curvature[:n] = 1.0 / self.size
         effective_modulus = 0.5 * rocks.elastic_modulus / (1.0 - rocks.poisson_ratio**2)
         self.hertz = config.stiffness_factor * 4.0 / 3.0 * effective_modulus
+        self.softness = np.zeros(n + 1 + n_machine_bodies)
+        if config.linear_overlap > 0.0:
+            # As the plant engine has it: springs in series, by the rocks' volumes.
+            radius = np.cbrt(3.0 * volume[self.shape_index] / (4.0 * np.pi)) * self.size
+            self.softness[:n] = 0.5 / (self.hertz * np.sqrt(0.5 * radius * config.linear_overlap))
+            for piece in pieces:
+                self.softness[n + 1 + piece.body] = 1.0 / piece.stiffness
+        else:
+            self.softness[:n] = 1.0 / self.size
 
         self._lower_site, self._upper_site = _calc_site_box(site)
         self._grids = _make_grid_classes(self.radius)
@@ -557,8 +566,8 @@ class NonsmoothEngine:
         machine.arrays.row_values[:, solver.ROW_IMPULSE] = 0.0
         upsilon = 1.0 / (1.0 + 4.0 * config.damping_time)
         n_impacts = solver.prepare_rows(
-            rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, self.curvature, self.hertz,
-            config.linear_overlap, dt, upsilon, config.max_recovery_speed, config.impact_threshold,
+            rows, n_rows, body_a, body_b, self._bodies, n, machine.arrays, velocity, self.softness, self.hertz,
+            config.linear_overlap > 0.0, dt, upsilon, config.max_recovery_speed, config.impact_threshold,
         )  # fmt: skip
         if n_impacts > 0:
             solver.solve_impacts(

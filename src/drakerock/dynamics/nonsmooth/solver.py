@@ -210,9 +210,9 @@ def prepare_rows(
     n_rocks: int,
     machine: MachineArrays,
     velocity: Array,
-    curvature: Array,
+    softness: Array,
     hertz: float,
-    linear_overlap: float,
+    linear: bool,
     time_step: float,
     upsilon: float,
     max_recovery_speed: float,
@@ -225,9 +225,10 @@ def prepare_rows(
         bodies: (n_rocks + 1, BODY_WIDTH) rocks and, last, all that stands still; velocities before the step.
         n_rocks: B beyond it is body ``b - n_rocks - 1`` of the machine.
         machine, velocity: the machine and its generalised velocities before the step.
-        curvature: (bodies of the solve,) 1 / radius of a rock, 0 for all else [1/m].
-        hertz: 4/3 E*, E* the pair's effective modulus [Pa]: force = hertz sqrt(radius) overlap^(3/2).
-        linear_overlap: if above 0, force = hertz sqrt(radius linear_overlap) overlap instead [m].
+        softness: (bodies of the solve,) by Hertz's law 1 / radius of a rock [1/m], 0 for all else; by the linear law
+            1 / stiffness of each body's spring [m/N]. A pair has the sum.
+        hertz: 4/3 E*, E* the pair's effective modulus [Pa]: force = hertz overlap^(3/2) / sqrt(softness).
+        linear: force = overlap / softness instead.
         time_step: [s]; upsilon: 1 / (1 + 4 tau / dt).
         max_recovery_speed: at which overlaps push apart what carries no load, at most [m/s].
         impact_threshold: what approaches faster is an impact [m/s].
@@ -271,11 +272,11 @@ def prepare_rows(
         if gap > 0.0:
             # Apart: they may approach until they touch at the end of the step; by a linear law, overlap then.
             bias = -gap / time_step
-            if linear_overlap > 0.0 and not rigid:
-                stiffness, _ = _calc_stiffness(gap, curvature[a] + curvature[b], hertz, linear_overlap)
+            if linear and not rigid:
+                stiffness, _ = _calc_stiffness(gap, softness[a] + softness[b], hertz, linear)
                 compliance = 1.0 / (stiffness * time_step * time_step)
         else:
-            stiffness, power = _calc_stiffness(gap, curvature[a] + curvature[b], hertz, linear_overlap)
+            stiffness, power = _calc_stiffness(gap, softness[a] + softness[b], hertz, linear)
             bias = -4.0 * upsilon * (1.0 / power) * gap / time_step
             if rigid:
                 bias = min(bias, max_recovery_speed)
@@ -308,14 +309,14 @@ def prepare_rows(
 
 
 @kernel
-def _calc_stiffness(gap: float, curvature: float, hertz: float, linear_overlap: float) -> tuple[float, float]:
+def _calc_stiffness(gap: float, softness: float, hertz: float, linear: bool) -> tuple[float, float]:
     """Return a contact's stiffness dF/dd [N/m], and the power of the overlap that its force grows with.
 
     About an overlap the force is that of a spring of this stiffness, stretched by 1 / power of the overlap.
     """
-    if linear_overlap > 0.0:
-        return hertz * math.sqrt(linear_overlap / curvature), 1.0
-    return 1.5 * hertz * math.sqrt(max(-gap, MIN_OVERLAP) / curvature), 1.5
+    if linear:
+        return 1.0 / softness, 1.0
+    return 1.5 * hertz * math.sqrt(max(-gap, MIN_OVERLAP) / softness), 1.5
 
 
 @kernel

@@ -31,9 +31,9 @@ def draw_rows(rng, n_rows, n_rocks):
     bodies[:n_rocks, solver.INVERSE_MASS] = 0.01
     bodies[:n_rocks, solver.INVERSE_INERTIA : solver.INVERSE_INERTIA + 6] = [0.2, 0.02, 0.01, 0.3, 0.02, 0.25]
     machine = make_machineless_step().arrays
-    curvature = np.append(np.full(n_rocks, 2.0), 0.0)
+    softness = np.append(np.full(n_rocks, 2.0), 0.0)
     solver.prepare_rows(
-        rows, n_rows, body_a, body_b, bodies, n_rocks, machine, np.zeros(0), curvature, 7e8, 0.0, 0.01, 0.05, 1.0, 10.0
+        rows, n_rows, body_a, body_b, bodies, n_rocks, machine, np.zeros(0), softness, 7e8, False, 0.01, 0.05, 1.0, 10.0
     )  # fmt: skip
     return rows, body_a, body_b, bodies
 
