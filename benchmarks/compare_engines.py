@@ -5,11 +5,12 @@
 
 `digs`: each seed is one pile, filled and at rest in the nonsmooth engine, relaxed for a second in each engine with
 the machine standing, then dug with the same motor targets. Finished runs are skipped, unless they were of another
-pile: that of a seed comes out otherwise on another processor. `--points 1`: the nonsmooth engine with one contact
-point per pair, as the plant engine's point contact has it. `--against hydroelastic`: the plant engine with pressure
-fields over faces instead of single points, five times as dear. `--set damping_time=2`: another setting of the
-nonsmooth engine; give it an `--out` of its own. `--repeats 3`: each pile is dug three times in the nonsmooth engine,
-with one more iteration each, and their mean taken: digs are chaotic, these are cheap.
+pile: that of a seed comes out otherwise on another processor. The table is over all that are stored; `--seeds 0` makes
+it alone. `--points 1`: the nonsmooth engine with one contact point per pair, as the plant engine's point contact has
+it. `--against hydroelastic`: the plant engine with pressure fields over faces instead of single points, five times as
+dear. `--set damping_time=2`: another setting of the nonsmooth engine; give it an `--out` of its own. `--repeats 3`:
+each pile is dug three times in the nonsmooth engine, with one more iteration each, and their mean taken: digs are
+chaotic, these are cheap.
 
 One contact law in both, of the same sharp rocks, is `--points 1 --dissipation 0 --set linear_overlap=0.001
 damping_time=1 impact_threshold=50 rounding=0.002`: the plant's springs, as damped as an implicit Euler step makes them,
@@ -32,6 +33,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from faithfulness import SIZES, compare, make_small_pile
@@ -199,9 +201,9 @@ def compare_states(arguments: argparse.Namespace) -> None:
     variants = [replace(one, nonsmooth=dict(arguments.set) | one.nonsmooth) for one in arguments.variants]
     windows = [round(edge / TIME_STEP) for edge in STATE_WINDOWS]
     results = {(r["seed"], r["variant"]): r["push_kN"] for r in read_lines(arguments.out)}
-    seeds = range(arguments.first, arguments.first + arguments.seeds)
-    for seed in seeds:
-        if all((seed, variant.name) in results for variant in variants):
+    names = [variant.name for variant in variants]
+    for seed in range(arguments.first, arguments.first + arguments.seeds):
+        if all((seed, name) in results for name in names):
             continue
         pile, depth = make_start(arguments.rocks, seed)
         dig = Dig(pile, variants[0], depth)
@@ -219,17 +221,20 @@ def compare_states(arguments: argparse.Namespace) -> None:
             results[seed, variant.name] = pushes
             add_line(arguments.out, {"seed": seed, "variant": variant.name, "push_kN": pushes})
         print(f"pile {seed}", flush=True)
-    base = np.concatenate([results[seed, variants[0].name] for seed in seeds])
+    seeds = find_complete(results, names)
+    if not seeds:
+        return
+    base = np.concatenate([results[seed, names[0]] for seed in seeds])
     pushed = np.average(base, axis=1, weights=np.diff(STATE_WINDOWS)) > MIN_PUSH
     edges = [f"{low:g} to {high:g} s" for low, high in pairwise(STATE_WINDOWS)] + ["all"]
     print(f"push [kN] of {pushed.sum()} states, and the difference (90 %): " + ", ".join(edges))
-    for variant in variants:
-        pushes = np.concatenate([results[seed, variant.name] for seed in seeds])
+    for name in names:
+        pushes = np.concatenate([results[seed, name] for seed in seeds])
         cells = []
         for a, b in zip(*(_append_mean(one[pushed]).T for one in (pushes, base)), strict=True):
             mean, half = compare(a, b)
             cells.append(f"{a.mean():.1f} ({100 * mean / b.mean():+.1f} ± {100 * half / b.mean():.1f} %)")
-        print(f"{variant.name}: " + ", ".join(cells))
+        print(f"{name}: " + ", ".join(cells))
 
 
 def _append_mean(pushes: np.ndarray) -> np.ndarray:
@@ -243,6 +248,11 @@ def read_lines(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
+def find_complete[Kind](results: dict[tuple[int, Kind], Any], kinds: list[Kind]) -> list[int]:
+    """Return the seeds that have results of all kinds, those of earlier calls among them."""
+    return sorted({seed for seed, _ in results if all((seed, kind) in results for kind in kinds)})
+
+
 def add_line(path: Path, entry: dict[str, object]) -> None:
     with open(path, "a", encoding="utf-8") as file:
         file.write(json.dumps(entry) + "\n")
@@ -250,26 +260,25 @@ def add_line(path: Path, entry: dict[str, object]) -> None:
 
 def compare_digs(arguments: argparse.Namespace) -> None:
     """Dig the piles in both engines, unless that is stored; print the differences."""
-    results = {(r["seed"], r["engine"], r["repeat"]): r for r in read_lines(arguments.out)}
+    results = {(r["seed"], (r["engine"], r["repeat"])): r for r in read_lines(arguments.out)}
     settings = dict(arguments.set)
     iterations = settings.pop("iterations", float(NonsmoothConfig().iterations))
     ours = f"nonsmooth-{arguments.points}"
     digs = [(arguments.against, 0)] + [(ours, repeat) for repeat in range(arguments.repeats)]
-    seeds = range(arguments.first, arguments.first + arguments.seeds)
-    for seed in seeds:
-        if all((seed, *dig) in results for dig in digs):
+    for seed in range(arguments.first, arguments.first + arguments.seeds):
+        if all((seed, dig) in results for dig in digs):
             continue
         pile, depth = make_start(arguments.rocks, seed)
         mark = hashlib.sha256(pile.p_WRs.tobytes()).hexdigest()[:12]
         for engine, repeat in digs:
-            if results.get((seed, engine, repeat), {}).get("pile") == mark:
+            if results.get((seed, (engine, repeat)), {}).get("pile") == mark:
                 continue
             own = {"manifold_points": float(arguments.points), "iterations": iterations + repeat}
             variant = Variant(
                 "nonsmooth" if engine == ours else engine, settings | own, arguments.dissipation
             )
             result = run(pile, variant, depth, arguments.duration)
-            results[seed, engine, repeat] = result
+            results[seed, (engine, repeat)] = result
             entry = {
                 "seed": seed,
                 "engine": engine,
@@ -280,10 +289,13 @@ def compare_digs(arguments: argparse.Namespace) -> None:
             }
             add_line(arguments.out, entry)
             print(seed, engine, repeat, len(pile), {k: round(v, 2) for k, v in result.items()}, flush=True)
+    seeds = find_complete(results, digs)
+    if len(seeds) < 2:
+        return
     for metric in (*METRICS, "cpu_s"):
         a, b = (
             np.array(
-                [np.mean([results[seed, *dig][metric] for dig in digs if dig[0] == engine]) for seed in seeds]
+                [np.mean([results[seed, dig][metric] for dig in digs if dig[0] == engine]) for seed in seeds]
             )
             for engine in (ours, arguments.against)
         )
