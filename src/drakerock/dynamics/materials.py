@@ -24,6 +24,19 @@ def calc_contact_stiffness(
     return 4.0 / 3.0 * e_star * math.sqrt(0.5 * radius * reference_overlap)
 
 
+def calc_spring_stiffness(
+    elastic_modulus: float, poisson_ratio: float, volume: float, reference_overlap: float
+) -> float:
+    """Return the stiffness of a body's own spring [N/m]: in series, two like ones have that of their contact.
+
+    Args:
+        elastic_modulus, poisson_ratio, reference_overlap: as for `calc_contact_stiffness`.
+        volume: of the body [m^3].
+    """
+    radius = (3.0 * volume / (4.0 * math.pi)) ** (1.0 / 3.0)
+    return 2.0 * calc_contact_stiffness(elastic_modulus, poisson_ratio, radius, reference_overlap)
+
+
 def calc_pair_friction(first: float, second: float) -> float:
     """Return the pair's friction coefficient, 2 a b / (a + b), as Drake combines bodies."""
     return 2.0 * first * second / (first + second)

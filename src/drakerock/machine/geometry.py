@@ -118,17 +118,20 @@ def collision_pieces(
                 continue
             X_BG = inspector.GetPoseInFrame(geometry)
             vertices = _make_vertices(inspector, geometry)
-            properties = inspector.GetProximityProperties(geometry)
-            friction: CoulombFriction = properties.GetProperty("material", "coulomb_friction")  # type: ignore[assignment]
             piece = CollisionPiece(
                 (X_BG.rotation().matrix() @ vertices.T).T + X_BG.translation(),
-                float(friction.dynamic_friction()),
-                float(
-                    properties.GetPropertyOrDefault("material", "point_contact_stiffness", POINT_STIFFNESS)
-                ),
+                *get_material(inspector, geometry),
             )
             pieces.setdefault(body.name(), []).append(piece)
     return pieces
+
+
+def get_material(inspector: SceneGraphInspector, geometry: GeometryId) -> tuple[float, float]:
+    """Return a collision geometry's dynamic friction and the stiffness of its point contacts [N/m]."""
+    properties = inspector.GetProximityProperties(geometry)
+    friction: CoulombFriction = properties.GetProperty("material", "coulomb_friction")  # type: ignore[assignment]
+    stiffness = properties.GetPropertyOrDefault("material", "point_contact_stiffness", POINT_STIFFNESS)
+    return float(friction.dynamic_friction()), float(stiffness)
 
 
 def _make_vertices(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:

@@ -32,7 +32,7 @@ from drakerock.dynamics.nonsmooth.machine_step import (
     calc_free_motion,
     make_machine_arrays,
 )
-from drakerock.machine.geometry import POINT_STIFFNESS, collision_pieces
+from drakerock.machine.geometry import collision_pieces, get_material
 from drakerock.machine.model import Machine
 
 Array = NDArray[np.float64]
@@ -242,12 +242,8 @@ class MachineView(LeafSystem):
             # Looked up once per geometry: it follows from the finalized plant alone.
             inspector = query.inspector()
             body = self._plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
-            properties = inspector.GetProximityProperties(geometry)
-            self._materials[geometry] = (
-                self._body_number.get(int(body.index())),
-                properties.GetPropertyOrDefault("material", "point_contact_stiffness", POINT_STIFFNESS),
-                properties.GetProperty("material", "coulomb_friction").dynamic_friction(),
-            )
+            mu, stiffness = get_material(inspector, geometry)
+            self._materials[geometry] = self._body_number.get(int(body.index())), stiffness, mu
         return self._materials[geometry]
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drakerock.dynamics.config import NonsmoothConfig
+from drakerock.dynamics.materials import calc_spring_stiffness
 from drakerock.dynamics.nonsmooth import contacts, motion, reduction, resting, solver
 from drakerock.dynamics.nonsmooth.batches import make_batch_arrays
 from drakerock.dynamics.nonsmooth.collision import broad_phase, foresight, narrow_phase
@@ -255,9 +256,15 @@ class NonsmoothEngine:
         self.hertz = config.stiffness_factor * 4.0 / 3.0 * effective_modulus
         self.softness = np.zeros(n + 1 + n_machine_bodies)
         if config.linear_overlap > 0.0:
-            # As the plant engine has it: springs in series, by the rocks' volumes.
-            radius = np.cbrt(3.0 * volume[self.shape_index] / (4.0 * np.pi)) * self.size
-            self.softness[:n] = 0.5 / (self.hertz * np.sqrt(0.5 * radius * config.linear_overlap))
+            # As the plant engine has it: springs in series.
+            stiffness = [
+                config.stiffness_factor
+                * calc_spring_stiffness(
+                    rocks.elastic_modulus, rocks.poisson_ratio, mass / rocks.density, config.linear_overlap
+                )
+                for mass in self.mass
+            ]
+            self.softness[:n] = np.reciprocal(stiffness)
             for piece in pieces:
                 self.softness[n + 1 + piece.body] = 1.0 / piece.stiffness
         else:

@@ -273,8 +273,7 @@ def prepare_rows(
             # Apart: they may approach until they touch at the end of the step; by a linear law, overlap then.
             bias = -gap / time_step
             if linear and not rigid:
-                stiffness, _ = _calc_stiffness(gap, softness[a] + softness[b], hertz, linear)
-                compliance = 1.0 / (stiffness * time_step * time_step)
+                compliance = (softness[a] + softness[b]) / (time_step * time_step)
         else:
             stiffness, power = _calc_stiffness(gap, softness[a] + softness[b], hertz, linear)
             bias = -4.0 * upsilon * (1.0 / power) * gap / time_step

@@ -19,7 +19,7 @@ from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, Leaf
 from drakerock.dynamics.assembly import make_convex, make_pose
 from drakerock.dynamics.config import DynamicsConfig
 from drakerock.dynamics.interface import ROCK_SUMMARY
-from drakerock.dynamics.materials import calc_contact_stiffness
+from drakerock.dynamics.materials import calc_spring_stiffness
 from drakerock.dynamics.nonsmooth.motion import HUGE
 from drakerock.errors import SimulationFailure
 from drakerock.pile.config import RocksConfig
@@ -76,10 +76,9 @@ def _make_kind(
         np.zeros(3),
         RotationalInertia(*np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2]),
     )
-    radius = (3.0 * volume / (4.0 * np.pi)) ** (1.0 / 3.0)
-    # Drake puts the two bodies' stiffnesses in series, so each has twice the contact's.
-    stiffness = 2.0 * calc_contact_stiffness(
-        rocks.elastic_modulus, rocks.poisson_ratio, radius, dynamics.reference_overlap
+    # Drake puts the two bodies' stiffnesses in series.
+    stiffness = calc_spring_stiffness(
+        rocks.elastic_modulus, rocks.poisson_ratio, volume, dynamics.reference_overlap
     )
     properties = ProximityProperties()
     AddContactMaterial(
