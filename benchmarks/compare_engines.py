@@ -41,15 +41,15 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from rocks import ROCKS, SHAPES, TIME_STEP, Motors, calc_bucket_mass, clear_way, make_dig
 
-from drakerock.dynamics.assembly import add_plant, add_site
-from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig, PlantEngineConfig
-from drakerock.dynamics.nonsmooth.system import add_nonsmooth_rocks
-from drakerock.dynamics.plant.rocks import add_plant_rocks, add_rock_bodies
-from drakerock.machine.config import MachineConfig
-from drakerock.machine.model import add_machine, calc_motor_targets
-from drakerock.machine.placement import set_machine_pose
-from drakerock.pile.site import make_site
-from drakerock.pile.state import PileState
+from drakerock.lhd.config import MachineConfig
+from drakerock.lhd.model import add_machine, calc_motor_targets
+from drakerock.lhd.placement import set_machine_pose
+from drakerock.rocks.drake.assembly import add_plant, add_site
+from drakerock.rocks.drake.plant_engine import add_plant_rocks, add_rock_bodies
+from drakerock.rocks.drake.system import add_nonsmooth_rocks
+from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig, PlantEngineConfig
+from drakerock.rocks.site import make_site
+from drakerock.rocks.state import PileState
 
 METRICS = ("bucket_mass_kg", "peak_push_kN", "mean_push_kN", "displaced_m3", "reach_m")
 RELAXING = 1.0

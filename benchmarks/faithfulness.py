@@ -52,14 +52,14 @@ from rocks import (
 )
 from scipy import stats
 
-from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
-from drakerock.dynamics.nonsmooth.system import NonsmoothRocks
-from drakerock.dynamics.settling import PileRecipe, make_pile
 from drakerock.loading.config import LoadingConfig
 from drakerock.loading.cycle import run_cycle
 from drakerock.loading.scenario import Scenario
-from drakerock.pile.config import PileConfig, SiteConfig
-from drakerock.pile.state import PileState
+from drakerock.rocks.config import PileConfig, SiteConfig
+from drakerock.rocks.drake.system import NonsmoothRocks
+from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
+from drakerock.rocks.making.settling import PileRecipe, make_pile
+from drakerock.rocks.state import PileState
 
 # Per size of pile: number of rocks, site and emission height.
 SIZES = {

@@ -11,7 +11,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from rocks import TIME_STEP, build_dig, clear_way, get_pile, make_dig
 
-from drakerock.dynamics.config import NonsmoothConfig
+from drakerock.rocks.engine.config import NonsmoothConfig
 from drakerock.viewing.force_network import draw_force_network
 
 # When the bucket pushes into the pile [s].

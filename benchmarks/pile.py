@@ -18,13 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from drakerock.dynamics.settling import calc_creep, fetch_pile, make_pile, refill, settle
 from drakerock.loading.scenario import Scenario, make_recipe
-from drakerock.pile.emission import calc_level, make_emitter
-from drakerock.pile.shapes import load_rock_shapes
-from drakerock.pile.site import make_site
-from drakerock.pile.state import save_pile
-from drakerock.pile.summary import calc_summary
+from drakerock.rocks.making.emission import calc_level, make_emitter
+from drakerock.rocks.making.settling import calc_creep, fetch_pile, make_pile, refill, settle
+from drakerock.rocks.shapes import load_rock_shapes
+from drakerock.rocks.site import make_site
+from drakerock.rocks.state import save_pile
+from drakerock.rocks.summary import calc_summary
 
 RECIPE = make_recipe(Scenario())
 SHAPES = load_rock_shapes(RECIPE.rocks.shapes)

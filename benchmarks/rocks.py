@@ -19,21 +19,21 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
-from drakerock.dynamics.assembly import add_plant, add_site
-from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
-from drakerock.dynamics.interface import ROCK_SUMMARY
-from drakerock.dynamics.nonsmooth.engine import NonsmoothEngine
-from drakerock.dynamics.nonsmooth.system import NonsmoothRocks, add_nonsmooth_rocks
-from drakerock.dynamics.settling import fetch_pile
+from drakerock.lhd.config import MachineConfig
+from drakerock.lhd.model import Machine, add_machine, calc_motor_targets
+from drakerock.lhd.placement import set_machine_pose
 from drakerock.loading.cycle import run_cycle
 from drakerock.loading.scenario import Scenario, make_recipe
-from drakerock.machine.config import MachineConfig
-from drakerock.machine.model import Machine, add_machine, calc_motor_targets
-from drakerock.machine.placement import set_machine_pose
-from drakerock.pile.config import RocksConfig, SiteConfig
-from drakerock.pile.shapes import load_rock_shapes
-from drakerock.pile.site import make_site
-from drakerock.pile.state import PileState, load_pile
+from drakerock.rocks.config import RocksConfig, SiteConfig
+from drakerock.rocks.drake.assembly import add_plant, add_site
+from drakerock.rocks.drake.interface import ROCK_SUMMARY
+from drakerock.rocks.drake.system import NonsmoothRocks, add_nonsmooth_rocks
+from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
+from drakerock.rocks.engine.engine import NonsmoothEngine
+from drakerock.rocks.making.settling import fetch_pile
+from drakerock.rocks.shapes import load_rock_shapes
+from drakerock.rocks.site import make_site
+from drakerock.rocks.state import PileState, load_pile
 
 ROCKS = RocksConfig()
 SHAPES = load_rock_shapes(ROCKS.shapes)

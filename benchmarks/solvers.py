@@ -21,10 +21,10 @@ from faithfulness import SIZES, draw_dig, get_start
 from numpy.typing import NDArray
 from rocks import TIME_STEP, clear_way, make_dig, run_dig
 
-from drakerock.dynamics.config import NonsmoothConfig
-from drakerock.dynamics.nonsmooth import contacts, resting, solver
-from drakerock.dynamics.nonsmooth.batches import make_batch_arrays
-from drakerock.dynamics.nonsmooth.compiling import allocating_kernel
+from drakerock.rocks.engine import contacts, resting, solver
+from drakerock.rocks.engine.batches import make_batch_arrays
+from drakerock.rocks.engine.compiling import allocating_kernel
+from drakerock.rocks.engine.config import NonsmoothConfig
 
 Array = NDArray[Any]
 Accelerator = Callable[[Array, Array], Array]

@@ -12,17 +12,17 @@ import pytest
 from hypothesis import settings
 from pydrake.systems.framework import DiagramBuilder
 
-from drakerock.dynamics.assembly import add_plant
-from drakerock.dynamics.config import DynamicsConfig
+from drakerock.lhd.config import MachineConfig
+from drakerock.lhd.geometry import make_bucket_geometry
+from drakerock.lhd.kinematics import make_kinematics
+from drakerock.lhd.model import add_machine
 from drakerock.loading.planning import DiggingMachine
 from drakerock.loading.scenario import Scenario
-from drakerock.machine.config import MachineConfig
-from drakerock.machine.geometry import make_bucket_geometry
-from drakerock.machine.kinematics import make_kinematics
-from drakerock.machine.model import add_machine
-from drakerock.pile.config import RocksConfig
-from drakerock.pile.shapes import RockShape, load_rock_shapes
-from drakerock.pile.state import PileState
+from drakerock.rocks.config import RocksConfig
+from drakerock.rocks.drake.assembly import add_plant
+from drakerock.rocks.engine.config import DynamicsConfig
+from drakerock.rocks.shapes import RockShape, load_rock_shapes
+from drakerock.rocks.state import PileState
 
 # Piles and kernels made by tests never come from, nor go to, the user's cache; pytest-xdist's workers share one.
 if "PYTEST_XDIST_WORKER" not in os.environ:

@@ -8,15 +8,15 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from drakerock.dynamics.assembly import add_plant, add_site
-from drakerock.dynamics.config import DynamicsConfig
-from drakerock.dynamics.nonsmooth.system import add_nonsmooth_rocks
-from drakerock.machine.config import MachineConfig
-from drakerock.machine.model import add_machine, calc_motor_targets
-from drakerock.machine.placement import set_machine_pose
-from drakerock.pile.config import RocksConfig, SiteConfig
-from drakerock.pile.shapes import load_rock_shapes
-from drakerock.pile.site import make_site
+from drakerock.lhd.config import MachineConfig
+from drakerock.lhd.model import add_machine, calc_motor_targets
+from drakerock.lhd.placement import set_machine_pose
+from drakerock.rocks.config import RocksConfig, SiteConfig
+from drakerock.rocks.drake.assembly import add_plant, add_site
+from drakerock.rocks.drake.system import add_nonsmooth_rocks
+from drakerock.rocks.engine.config import DynamicsConfig
+from drakerock.rocks.shapes import load_rock_shapes
+from drakerock.rocks.site import make_site
 
 
 class Rates(LeafSystem):

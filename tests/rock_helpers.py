@@ -6,13 +6,13 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from drakerock.dynamics.config import NonsmoothConfig
-from drakerock.dynamics.nonsmooth.engine import MachineStep, NonsmoothEngine, RockArrays, StepReport
-from drakerock.dynamics.nonsmooth.solver import MACHINE_ROW_WIDTH, MachineArrays
-from drakerock.pile.config import RocksConfig, SiteConfig
-from drakerock.pile.shapes import RockShape
-from drakerock.pile.site import Plane, Site
-from drakerock.pile.state import PileState
+from drakerock.rocks.config import RocksConfig, SiteConfig
+from drakerock.rocks.engine.config import NonsmoothConfig
+from drakerock.rocks.engine.engine import MachineStep, NonsmoothEngine, RockArrays, StepReport
+from drakerock.rocks.engine.solver import MACHINE_ROW_WIDTH, MachineArrays
+from drakerock.rocks.shapes import RockShape
+from drakerock.rocks.site import Plane, Site
+from drakerock.rocks.state import PileState
 
 
 def make_shape(mesh: trimesh.Trimesh, name: str = "shape") -> RockShape:

@@ -192,7 +192,7 @@ def machine_check(
 
     Example: drakerock machine check studies/demo.yaml
     """
-    from drakerock.machine.checks import make_check_data, make_check_table, run_machine_checks
+    from drakerock.lhd.checks.checks import make_check_data, make_check_table, run_machine_checks
 
     with _show_progress("machine check"):
         rows = run_machine_checks(_load(scenario, None, set_).machine)
@@ -215,7 +215,7 @@ def machine_show(
     Example: drakerock machine show --out out/machine
     """
     from drakerock.files import make_folder
-    from drakerock.machine.page import write_machine_page
+    from drakerock.lhd.checks.page import write_machine_page
 
     make_folder(out)
     with _show_progress("machine show"):

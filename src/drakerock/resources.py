@@ -1,4 +1,4 @@
-"""Where the shipped data (SDFormat files, study files) lives, in a wheel and in a checkout."""
+"""Where the shipped data (models, the default pile, study files) lives, in a wheel and in a checkout."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ _CHECKOUT = _PACKAGE.parent.parent
 
 
 def find_data(*parts: str) -> Path:
-    """Return the path of a shipped file or folder, such as ``find_data("sdf", "package.xml")``.
+    """Return the path of a shipped file or folder, such as ``find_data("models", "package.xml")``.
 
     Raises:
         FileNotFoundError: neither the installed package nor the checkout has it.
     """
-    for root in (_PACKAGE / "data", _CHECKOUT):
+    for root in (_PACKAGE, _PACKAGE / "data", _CHECKOUT):
         path = root.joinpath(*parts)
         if path.exists():
             return path

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from drakerock.cli import app
 from drakerock.loading.plan import DigPlan
 from drakerock.loading.scenario import load_scenario
-from drakerock.pile.state import load_pile
+from drakerock.rocks.state import load_pile
 
 COMMAND = Path(sys.executable).with_name("drakerock")
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import InitializeParams, Simulator
 
-from drakerock.dynamics.plant.rocks import PlantRocks
+from drakerock.lhd.placement import set_machine_pose
 from drakerock.loading.control import FeedforwardController, Mode
 from drakerock.loading.cycle import run_cycle
 from drakerock.loading.plan_file import save_plan
 from drakerock.loading.recording import load_recording, save_recording
 from drakerock.loading.signals import calc_signals
 from drakerock.loading.station import make_station
-from drakerock.machine.placement import set_machine_pose
+from drakerock.rocks.drake.plant_engine import PlantRocks
 from drakerock.study.jobs import get_pile
 
 

@@ -12,12 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from drakerock.dynamics.nonsmooth.engine import NonsmoothEngine
+from drakerock.rocks.engine.engine import NonsmoothEngine
 from drakerock.loading.scenario import Scenario
-from drakerock.pile.emission import make_emitter, place_rocks, sample_rocks
-from drakerock.pile.shapes import load_rock_shapes
-from drakerock.pile.site import make_site
-from drakerock.pile.state import make_empty_pile
+from drakerock.rocks.making.emission import make_emitter, place_rocks, sample_rocks
+from drakerock.rocks.shapes import load_rock_shapes
+from drakerock.rocks.site import make_site
+from drakerock.rocks.state import make_empty_pile
 
 scenario = Scenario.model_validate({"site": {"void_depth": 3.0, "rear_layer": 0.0}})
 shapes = load_rock_shapes(scenario.rocks.shapes)
@@ -50,7 +50,7 @@ def test_cold_and_warm_cache_give_the_same_bits(tmp_path):
 
 
 KERNELS = """
-from drakerock.dynamics.nonsmooth.compiling import kernel
+from drakerock.rocks.engine.compiling import kernel
 
 
 @kernel
@@ -80,7 +80,7 @@ print(sum(sum(item.stats.cache_misses.values()) for item in (kernels.find_mean, 
 
 HOLD = """
 import time
-from drakerock.dynamics.nonsmooth import compiling
+from drakerock.rocks.engine import compiling
 
 with compiling._one_process:
     print("held", flush=True)

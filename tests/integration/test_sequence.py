@@ -3,12 +3,12 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from drakerock.dynamics.contact_graph import find_loose
 from drakerock.errors import InputError
 from drakerock.loading.sequence import run_sequence
-from drakerock.pile.config import RocksConfig
-from drakerock.pile.shapes import load_rock_shapes
-from drakerock.pile.state import load_pile
+from drakerock.rocks.config import RocksConfig
+from drakerock.rocks.contact_graph import find_loose
+from drakerock.rocks.shapes import load_rock_shapes
+from drakerock.rocks.state import load_pile
 
 N = 3
 

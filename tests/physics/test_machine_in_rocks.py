@@ -9,10 +9,10 @@ import pytest
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialVelocity
 
-from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
-from drakerock.pile.config import RocksConfig, SiteConfig
-from drakerock.pile.shapes import load_rock_shapes
-from drakerock.pile.site import make_site
+from drakerock.rocks.config import RocksConfig, SiteConfig
+from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
+from drakerock.rocks.shapes import load_rock_shapes
+from drakerock.rocks.site import make_site
 from machine_rocks_helpers import Scene
 from rock_helpers import draw_quaternion, make_engine, make_pile, run
 

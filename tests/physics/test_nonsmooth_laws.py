@@ -9,9 +9,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from drakerock.dynamics.config import NonsmoothConfig
-from drakerock.dynamics.nonsmooth.engine import MachinePiece
-from drakerock.pile.config import RocksConfig
+from drakerock.rocks.config import RocksConfig
+from drakerock.rocks.engine.config import NonsmoothConfig
+from drakerock.rocks.engine.engine import MachinePiece
 from rock_helpers import (
     make_ball,
     make_box,

@@ -6,10 +6,10 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
-from drakerock.dynamics.assembly import add_plant
-from drakerock.dynamics.config import DynamicsConfig, NonsmoothConfig
-from drakerock.dynamics.plant.rocks import add_plant_rocks, add_rock_bodies
-from drakerock.pile.config import RocksConfig
+from drakerock.rocks.config import RocksConfig
+from drakerock.rocks.drake.assembly import add_plant
+from drakerock.rocks.drake.plant_engine import add_plant_rocks, add_rock_bodies
+from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
 from rock_helpers import make_box, make_engine, make_pile, make_plane_site, run
 
 WIDTH, HEIGHT = 0.4, 1.0

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drakerock.lhd.kinematics import Kinematics, calc_bucket_range
+from drakerock.lhd.measurement import MEASUREMENT
 from drakerock.loading.config import ControlConfig
 from drakerock.loading.plan import DigPlan, NoPlan, calc_motor_rates, clamp_rates
-from drakerock.machine.kinematics import Kinematics, calc_bucket_range
-from drakerock.machine.measurement import MEASUREMENT
 
 Array = NDArray[np.float64]
 
@@ -131,7 +131,7 @@ class FeedforwardController(LeafSystem):
 
     Input ports:
         ``plan``: abstract, a `DigPlan` or `NoPlan`.
-        ``measurement``: the machine's measurement vector (`drakerock.machine.MEASUREMENT`), in W.
+        ``measurement``: the machine's measurement vector (`drakerock.lhd.MEASUREMENT`), in W.
 
     Output ports:
         ``motor_speeds``: (3,) targets of wheels, boom and bucket [rad/s].

@@ -19,6 +19,7 @@ import drakerock
 from drakerock.config import calc_config_hash
 from drakerock.errors import SimulationFailure
 from drakerock.files import make_folder, write_text
+from drakerock.lhd.placement import set_machine_pose
 from drakerock.loading.control import TIMEOUTS, WAYPOINT_TIMES, Mode
 from drakerock.loading.field import HeightField
 from drakerock.loading.performance import (
@@ -37,8 +38,7 @@ from drakerock.loading.scenario import Scenario
 from drakerock.loading.signal_table import save_signals
 from drakerock.loading.signals import calc_signals
 from drakerock.loading.station import Station, make_station
-from drakerock.machine.placement import set_machine_pose
-from drakerock.pile.state import PileState, save_pile
+from drakerock.rocks.state import PileState, save_pile
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]

@@ -10,12 +10,12 @@ import shapely
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from drakerock.dynamics.contact_graph import find_loose
+from drakerock.lhd.geometry import BucketGeometry
 from drakerock.loading.config import PerformanceConfig
-from drakerock.machine.geometry import BucketGeometry
-from drakerock.pile.config import SiteConfig
-from drakerock.pile.shapes import RockShape
-from drakerock.pile.state import PileState
+from drakerock.rocks.config import SiteConfig
+from drakerock.rocks.contact_graph import find_loose
+from drakerock.rocks.shapes import RockShape
+from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drakerock.machine.kinematics import Kinematics, calc_joint_rates
+from drakerock.lhd.kinematics import Kinematics, calc_joint_rates
 
 Array = NDArray[np.float64]
 

@@ -12,11 +12,8 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem, State
 from scipy.optimize import brentq
 
-from drakerock.loading.config import PlanningConfig, SensingConfig, StrategyConfig
-from drakerock.loading.field import HeightField, PileProfile, calc_pile_profile
-from drakerock.loading.plan import DigPlan, NoPlan, SpeedTable, calc_motor_rates
-from drakerock.machine.geometry import BucketGeometry, calc_heaped_capacity
-from drakerock.machine.kinematics import (
+from drakerock.lhd.geometry import BucketGeometry, calc_heaped_capacity
+from drakerock.lhd.kinematics import (
     Kinematics,
     calc_bucket_range,
     calc_full_tilt,
@@ -24,6 +21,9 @@ from drakerock.machine.kinematics import (
     calc_pitch,
     calc_tip,
 )
+from drakerock.loading.config import PlanningConfig, SensingConfig, StrategyConfig
+from drakerock.loading.field import HeightField, PileProfile, calc_pile_profile
+from drakerock.loading.plan import DigPlan, NoPlan, SpeedTable, calc_motor_rates
 
 Array = NDArray[np.float64]
 

@@ -26,11 +26,11 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
 from drakerock.errors import InputError
-from drakerock.machine.model import Machine
+from drakerock.lhd.model import Machine
 from drakerock.npz import load_arrays, save_arrays
-from drakerock.pile.config import SiteConfig
-from drakerock.pile.shapes import RockShape
-from drakerock.pile.state import PileState
+from drakerock.rocks.config import SiteConfig
+from drakerock.rocks.shapes import RockShape
+from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
 FORMAT = "drakerock-recording"

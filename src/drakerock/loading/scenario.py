@@ -9,13 +9,13 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from drakerock.config import Config, load_config
-from drakerock.dynamics.config import DynamicsConfig
-from drakerock.dynamics.settling import PileRecipe
+from drakerock.lhd.config import MachineConfig
 from drakerock.loading.config import LoadingConfig
-from drakerock.machine.config import MachineConfig
-from drakerock.pile.config import PileConfig, RocksConfig, SiteConfig
-from drakerock.pile.emission import make_emitter
 from drakerock.resources import find_data
+from drakerock.rocks.config import PileConfig, RocksConfig, SiteConfig
+from drakerock.rocks.engine.config import DynamicsConfig
+from drakerock.rocks.making.emission import make_emitter
+from drakerock.rocks.making.settling import PileRecipe
 
 
 class RecordingConfig(Config):

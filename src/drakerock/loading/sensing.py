@@ -16,12 +16,12 @@ from scipy.stats import binned_statistic_2d
 from drakerock.errors import InputError
 from drakerock.loading.config import ScannerConfig, SensingConfig
 from drakerock.loading.field import HeightField
-from drakerock.pile.config import SiteConfig
-from drakerock.pile.geometry import cast_rays, make_pile_mesh
-from drakerock.pile.shapes import RockShape
-from drakerock.pile.site import calc_roof_height
-from drakerock.pile.state import PileState
 from drakerock.randomness import make_generator
+from drakerock.rocks.config import SiteConfig
+from drakerock.rocks.geometry import cast_rays, make_pile_mesh
+from drakerock.rocks.shapes import RockShape
+from drakerock.rocks.site import calc_roof_height
+from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
 

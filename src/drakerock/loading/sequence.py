@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from drakerock.config import calc_config_hash
-from drakerock.dynamics.settling import fetch_pile, refill
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.files import make_folder
 from drakerock.loading.cycle import CycleOutcome, CycleResult, run_cycle, save_cycle
 from drakerock.loading.scenario import Scenario, make_recipe
-from drakerock.pile.shapes import load_rock_shapes
-from drakerock.pile.state import PileState, load_pile, save_pile
 from drakerock.randomness import make_generator
+from drakerock.rocks.making.settling import fetch_pile, refill
+from drakerock.rocks.shapes import load_rock_shapes
+from drakerock.rocks.state import PileState, load_pile, save_pile
 
 SequenceProgress = Callable[[int, str, float], None]
 """Called with the loading's number, what is being done, and the simulated time [s]."""

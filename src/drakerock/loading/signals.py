@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
-from drakerock.dynamics.interface import ROCK_SUMMARY
+from drakerock.lhd.measurement import MEASUREMENT
+from drakerock.lhd.names import WHEEL_JOINTS
 from drakerock.loading.station import Station
-from drakerock.machine.measurement import MEASUREMENT
-from drakerock.machine.names import WHEEL_JOINTS
+from drakerock.rocks.drake.interface import ROCK_SUMMARY
 
 Array = NDArray[np.float64]
 

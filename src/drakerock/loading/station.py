@@ -11,23 +11,23 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
-from drakerock.dynamics.assembly import add_plant, add_site
-from drakerock.dynamics.interface import RockSystem
-from drakerock.dynamics.nonsmooth.system import NonsmoothRocks, add_nonsmooth_rocks
-from drakerock.dynamics.plant.rocks import PlantRocks, add_plant_rocks, add_rock_bodies
+from drakerock.lhd.geometry import collision_pieces, make_bucket_geometry
+from drakerock.lhd.hinge import add_hinge_moment
+from drakerock.lhd.kinematics import make_kinematics
+from drakerock.lhd.measurement import add_machine_sensor
+from drakerock.lhd.model import Machine, add_machine, calc_motor_targets
 from drakerock.loading.control import FeedforwardController
 from drakerock.loading.plan_file import load_plan
 from drakerock.loading.planning import DiggingMachine, DigPlanner
 from drakerock.loading.scenario import Scenario
 from drakerock.loading.sensing import PileSensor
-from drakerock.machine.geometry import collision_pieces, make_bucket_geometry
-from drakerock.machine.hinge import add_hinge_moment
-from drakerock.machine.kinematics import make_kinematics
-from drakerock.machine.measurement import add_machine_sensor
-from drakerock.machine.model import Machine, add_machine, calc_motor_targets
-from drakerock.pile.shapes import RockShape, load_rock_shapes
-from drakerock.pile.site import Site, make_site
-from drakerock.pile.state import PileState
+from drakerock.rocks.drake.assembly import add_plant, add_site
+from drakerock.rocks.drake.interface import RockSystem
+from drakerock.rocks.drake.plant_engine import PlantRocks, add_plant_rocks, add_rock_bodies
+from drakerock.rocks.drake.system import NonsmoothRocks, add_nonsmooth_rocks
+from drakerock.rocks.shapes import RockShape, load_rock_shapes
+from drakerock.rocks.site import Site, make_site
+from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
 

@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from drakerock.dynamics.settling import calc_creep, fetch_pile
 from drakerock.exploration.noise import calc_standard_error
 from drakerock.files import make_folder, write_text
 from drakerock.loading.cycle import CycleOutcome, run_cycle, save_cycle
 from drakerock.loading.recording import load_recording
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.loading.sequence import run_sequence
-from drakerock.pile.shapes import load_rock_shapes
-from drakerock.pile.site import make_site
-from drakerock.pile.state import PileState, save_pile
-from drakerock.pile.summary import calc_summary
+from drakerock.rocks.making.settling import calc_creep, fetch_pile
+from drakerock.rocks.shapes import load_rock_shapes
+from drakerock.rocks.site import make_site
+from drakerock.rocks.state import PileState, save_pile
+from drakerock.rocks.summary import calc_summary
 from drakerock.viewing.cycle_figures import write_cycle_figures
 from drakerock.viewing.pile_figures import write_pile_picture
 from drakerock.viewing.pile_page import write_pile_page

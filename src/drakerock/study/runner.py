@@ -16,10 +16,10 @@ from math import floor
 from pathlib import Path
 from typing import Any
 
-from drakerock.dynamics.nonsmooth.compiling import are_kernels_compiled, describe_compilation
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.problem import Array
 from drakerock.exploration.sampling import make_sampler, make_validation_points
+from drakerock.rocks.engine.compiling import are_kernels_compiled, describe_compilation
 from drakerock.study.display import Display
 from drakerock.study.executors import Executor, WorkerLost, make_executor
 from drakerock.study.schema import StudyConfig

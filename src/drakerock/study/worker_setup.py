@@ -11,7 +11,7 @@ def dask_setup(_worker: Any) -> None:
     """Ignore Ctrl-C, which a terminal sends to all its processes: the runner decides when workers stop."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # The runner says it, for all of them.
-    logging.getLogger("drakerock.dynamics.nonsmooth.compiling").setLevel(logging.ERROR)
+    logging.getLogger("drakerock.rocks.engine.compiling").setLevel(logging.ERROR)
     silence_closing()
 
 

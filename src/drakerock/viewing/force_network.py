@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from drakerock.pile.state import PileState
+from drakerock.rocks.state import PileState
 
 
 def draw_force_network(

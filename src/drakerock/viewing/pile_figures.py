@@ -14,9 +14,9 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from drakerock.errors import InputError
-from drakerock.pile.config import SiteConfig
-from drakerock.pile.shapes import RockShape
-from drakerock.pile.state import PileState
+from drakerock.rocks.config import SiteConfig
+from drakerock.rocks.shapes import RockShape
+from drakerock.rocks.state import PileState
 
 VIEWS = {"side": (0, 2, 1), "front": (1, 2, 0), "top": (0, 1, 2)}
 """Horizontal, vertical and depth axis (0 x, 1 y, 2 z) of each view."""

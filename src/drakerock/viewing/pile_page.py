@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 
-from drakerock.pile.config import SiteConfig
-from drakerock.pile.shapes import RockShape
-from drakerock.pile.state import PileState
+from drakerock.rocks.config import SiteConfig
+from drakerock.rocks.shapes import RockShape
+from drakerock.rocks.state import PileState
 from drakerock.viewing.scene import calc_rock_colors, draw_site, draw_still_rocks, write_scene
 
 _STATIC_TINT = np.array([0.75, 0.85, 1.1])  # on the colours, below 1

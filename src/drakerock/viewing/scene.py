@@ -11,7 +11,7 @@ from pydrake.geometry import Meshcat, Rgba
 from scipy.spatial.transform import Rotation
 
 from drakerock.files import write_text
-from drakerock.pile.config import SiteConfig
+from drakerock.rocks.config import SiteConfig
 
 Array = NDArray[np.float64]
 RockMesh = tuple[Array, NDArray[np.int64]]

@@ -5,6 +5,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
+from drakerock.lhd.kinematics import calc_jacobian, calc_pitch, calc_tip
+from drakerock.lhd.measurement import MEASUREMENT
 from drakerock.loading.config import ControlConfig
 from drakerock.loading.control import (
     TIMEOUTS,
@@ -16,8 +18,6 @@ from drakerock.loading.control import (
     calc_passed,
 )
 from drakerock.loading.plan import NoPlan
-from drakerock.machine.kinematics import calc_jacobian, calc_pitch, calc_tip
-from drakerock.machine.measurement import MEASUREMENT
 from tests.unit.loading.test_planning import make_wedge, plan_for
 
 

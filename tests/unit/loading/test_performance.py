@@ -16,7 +16,7 @@ from drakerock.loading.performance import (
     find_lost,
     find_weighing_events,
 )
-from drakerock.pile.config import SiteConfig
+from drakerock.rocks.config import SiteConfig
 
 CONFIG = PerformanceConfig()
 

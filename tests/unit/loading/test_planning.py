@@ -6,6 +6,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drakerock.lhd.kinematics import calc_bucket_range, calc_full_tilt, calc_pitch, calc_tip
 from drakerock.loading.config import PlanningConfig, SensingConfig, StrategyConfig
 from drakerock.loading.field import PileProfile
 from drakerock.loading.plan import DigPlan, NoPlan
@@ -17,7 +18,6 @@ from drakerock.loading.planning import (
     make_dig_plan,
     sweep_profile,
 )
-from drakerock.machine.kinematics import calc_bucket_range, calc_full_tilt, calc_pitch, calc_tip
 from tests.unit.loading.test_field import make_field
 
 PLANNING, SENSING = PlanningConfig(), SensingConfig()

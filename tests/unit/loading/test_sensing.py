@@ -20,8 +20,8 @@ from drakerock.loading.sensing import (
     make_grid,
     make_ray_directions,
 )
-from drakerock.pile.config import SiteConfig
-from drakerock.pile.state import PileState, make_empty_pile
+from drakerock.rocks.config import SiteConfig
+from drakerock.rocks.state import PileState, make_empty_pile
 
 
 def find_height_by_half_spaces(pile, shapes, x, y):

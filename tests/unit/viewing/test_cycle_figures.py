@@ -16,7 +16,7 @@ from drakerock.loading.plan_file import load_plan, save_plan
 from drakerock.loading.recording import Recording, Visual, save_recording
 from drakerock.loading.scenario import Scenario
 from drakerock.loading.signal_table import load_signals, save_signals
-from drakerock.pile.config import SiteConfig
+from drakerock.rocks.config import SiteConfig
 from drakerock.viewing.cycle_figures import (
     _find_outlines,
     calc_rock_poses,

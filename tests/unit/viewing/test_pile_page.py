@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from drakerock.errors import InputError
-from drakerock.pile.config import SiteConfig
+from drakerock.rocks.config import SiteConfig
 from drakerock.viewing.pile_figures import write_pile_picture
 from drakerock.viewing.pile_page import write_pile_page
 from drakerock.viewing.scene import calc_rock_colors

@@ -1,0 +1,1 @@
+"""Making piles: emission from above, settling, balancing, refilling, the cache."""

@@ -1,0 +1,185 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from drakerock.lhd.config import MachineConfig
+from drakerock.lhd.geometry import collision_pieces
+from drakerock.lhd.model import add_machine
+from drakerock.rocks.config import RocksConfig, SiteConfig
+from drakerock.rocks.contact_graph import find_contacts, find_loose
+from drakerock.rocks.drake.assembly import add_plant, add_site
+from drakerock.rocks.drake.coupling import make_machine_layout
+from drakerock.rocks.drake.interface import ROCK_SUMMARY
+from drakerock.rocks.drake.plant_engine import add_plant_rocks, add_rock_bodies
+from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
+from drakerock.rocks.materials import calc_contact_stiffness, calc_pair_friction
+from drakerock.rocks.site import make_site
+from drakerock.rocks.state import make_empty_pile
+from rock_helpers import make_engine
+
+
+def build(pile, shapes):
+    builder = DiagramBuilder()
+    plant, _ = add_plant(builder, DynamicsConfig())
+    add_site(plant, make_site(SiteConfig(drift_width=3.9)), DynamicsConfig())
+    geometries = add_rock_bodies(plant, pile, shapes, RocksConfig(), DynamicsConfig())
+    plant.Finalize()
+    rocks = add_plant_rocks(builder, plant, pile, geometries)
+    return builder.Build(), plant, rocks
+
+
+def test_written_pile_is_read_back_and_shown_by_the_ports(heap, shapes):
+    moving = replace(heap, V_WRs=np.random.default_rng(0).normal(size=(12, 6)))
+    diagram, plant, rocks = build(heap, shapes)
+    root = diagram.CreateDefaultContext()
+    rocks.set_pile(root, moving)
+    back = rocks.get_pile(root)
+    assert np.allclose(back.p_WRs, heap.p_WRs, atol=1e-12)
+    assert np.allclose(back.q_WRs, heap.q_WRs, atol=1e-12)
+    assert np.allclose(back.V_WRs, moving.V_WRs, atol=1e-12)
+    context = rocks.GetMyContextFromRoot(root)
+    poses = rocks.GetOutputPort("rock_poses").Eval(context).reshape(-1, 7)
+    assert np.allclose(poses, np.hstack([heap.q_WRs, heap.p_WRs]), atol=1e-12)
+    assert np.allclose(rocks.GetOutputPort("rock_velocities").Eval(context), moving.V_WRs.ravel(), atol=1e-12)
+    assert len(rocks.GetOutputPort("rock_summary").Eval(context)) == len(ROCK_SUMMARY)
+    body = plant.GetBodyByName("rock_7")
+    assert np.allclose(
+        plant.EvalBodyPoseInWorld(plant.GetMyContextFromRoot(root), body).translation(), heap.p_WRs[7]
+    )
+
+
+def test_rock_bodies_have_the_shapes_mass_and_inertia(heap, shapes):
+    _, plant, _ = build(heap, shapes)
+    rocks = RocksConfig()
+    masses = heap.calc_masses(np.array([shape.volume for shape in shapes]), rocks.density)
+    for rock in range(12):
+        body = plant.GetBodyByName(f"rock_{rock}")
+        assert body.default_mass() == pytest.approx(masses[rock], rel=1e-9)
+        inertia = body.default_spatial_inertia().CalcRotationalInertia().CopyToFullMatrix3()
+        assert np.allclose(inertia, rocks.density * heap.size[rock] ** 5 * shapes[heap.shape[rock]].inertia)
+
+
+def test_fixed_rocks_do_not_move(heap, shapes):
+
+    fixed = np.zeros(12, bool)
+    fixed[:3] = True
+    pile = replace(heap, fixed=fixed)
+    diagram, _, rocks = build(pile, shapes)
+    simulator = Simulator(diagram)
+    rocks.set_pile(simulator.get_mutable_context(), pile)
+    simulator.AdvanceTo(0.3)
+    after = rocks.get_pile(simulator.get_context())
+    assert np.array_equal(after.p_WRs[:3], pile.p_WRs[:3])
+    assert np.linalg.norm(after.p_WRs[3:] - pile.p_WRs[3:], axis=1).max() > 0.01
+
+
+def test_hundreds_of_fixed_rocks_are_no_trouble(heap, shapes):
+    """On the world's body, beside the floor, they made Drake 1.58 read stray memory."""
+    many = heap
+    for k in range(1, 30):
+        many = many.join(replace(heap, p_WRs=heap.p_WRs + [0.0, 0.0, 3.0 * k]))
+    pile = replace(many, fixed=np.arange(len(many)) >= len(heap))
+    diagram, plant, rocks = build(pile, shapes)
+    simulator = Simulator(diagram)
+    rocks.set_pile(simulator.get_mutable_context(), pile)
+    simulator.AdvanceTo(0.1)
+    after = rocks.get_pile(simulator.get_context())
+    assert np.array_equal(after.p_WRs[pile.fixed], pile.p_WRs[pile.fixed])
+    assert len(plant.GetCollisionGeometriesForBody(plant.GetBodyByName("fixed_rocks"))) == 29 * len(heap)
+
+
+def test_effective_friction_of_every_pair_is_the_methods():
+    builder = DiagramBuilder()
+    plant, scene_graph = add_plant(builder, DynamicsConfig())
+    machine = add_machine(plant, MachineConfig())
+    plant.Finalize()
+    pieces = collision_pieces(plant, scene_graph, machine)
+    rock, drift = RocksConfig().friction, SiteConfig().friction
+    tyre = pieces["wheel_front_left"][0].mu
+    bucket = {piece.mu for piece in pieces["bucket"]}
+    assert calc_pair_friction(rock, rock) == pytest.approx(0.9)
+    assert calc_pair_friction(rock, drift) == pytest.approx(1.0)
+    assert calc_pair_friction(tyre, drift) == pytest.approx(1.0)
+    for mu in bucket:
+        assert calc_pair_friction(rock, mu) == pytest.approx(1.0)
+
+
+def test_contact_stiffness_reproduces_hertz_at_the_reference_overlap():
+    E, nu, r, d = 1e9, 0.3, 0.2, 1e-3
+    k = calc_contact_stiffness(E, nu, r, d)
+    e_star = 1 / (2 * (1 - nu**2) / E)
+    assert k * d == pytest.approx(4 / 3 * e_star * np.sqrt(r / 2) * d**1.5)
+
+
+def test_contact_graph_finds_near_pairs_only(heap, shapes):
+    far = replace(heap, p_WRs=np.column_stack([np.arange(12.0), np.zeros(12), np.zeros(12)]))
+    assert len(find_contacts(far, shapes, 0.005)) == 0
+    assert find_loose(far, shapes, 0.005).sum() == 11
+    assert len(find_loose(make_empty_pile(), shapes, 0.005)) == 0
+    # Two cube-like rocks brought together: within the gap they touch, a hair beyond it not.
+    pair = heap.select(np.array([0, 6]))
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        moved = replace(pair, p_WRs=np.array([[0, 0, 0], [middle, 0, 0]], float))
+        low, high = (middle, high) if len(find_contacts(moved, shapes, 0.0)) else (low, middle)
+    touching = replace(pair, p_WRs=np.array([[0, 0, 0], [high + 0.004, 0, 0]]))
+    apart = replace(pair, p_WRs=np.array([[0, 0, 0], [high + 0.02, 0, 0]]))
+    assert len(find_contacts(touching, shapes, 0.005)) == 1
+    assert len(find_contacts(apart, shapes, 0.005)) == 0
+
+
+def test_only_the_floor_is_a_half_space(heap, shapes):
+    """Several unbounded geometries beside convex pieces crash Drake's proximity engine now and then."""
+    diagram, _, _ = build(heap, shapes)
+    inspector = diagram.GetSubsystemByName("scene_graph").model_inspector()
+    kinds = [type(inspector.GetShape(geometry)).__name__ for geometry in inspector.GetAllGeometryIds()]
+    assert kinds.count("HalfSpace") == 1
+    assert kinds.count("Box") == 3
+
+
+def test_walls_hold_rocks_in(heap, shapes):
+    """A rock thrown at each wall at 8 m/s comes back or stops, and none is beyond the wall's plane."""
+    site = make_site(SiteConfig(drift_width=3.9))
+    ways = np.array([[0, 8.0, 0], [0, -8.0, 0], [8.0, 0, 0]])
+    p = np.array([[-2.0, 1.0, 1.5], [-2.0, -1.0, 1.5], [site.config.void_depth - 1.5, 0, 1.5]])
+    three = heap.select(np.arange(3))
+    pile = replace(three, p_WRs=p, V_WRs=np.hstack([np.zeros((3, 3)), ways]))
+    diagram, _, rocks = build(pile, shapes)
+    simulator = Simulator(diagram)
+    rocks.set_pile(simulator.get_mutable_context(), pile)
+    simulator.Initialize()
+    simulator.AdvanceTo(0.5)
+    after = rocks.get_pile(simulator.get_context())
+    for plane in site.planes:
+        assert (after.p_WRs @ plane.normal > plane.offset).all()
+    assert (np.linalg.norm(after.V_WRs[:, 3:], axis=1) < 5.0).all()
+
+
+def test_the_nonsmooth_engines_linear_law_has_the_plants_springs(heap, shapes):
+    builder = DiagramBuilder()
+    dynamics = DynamicsConfig(nonsmooth=NonsmoothConfig(linear_overlap=DynamicsConfig().reference_overlap))
+    plant, scene_graph = add_plant(builder, dynamics)
+    machine = add_machine(plant, MachineConfig())
+    geometries = add_rock_bodies(plant, heap, shapes, RocksConfig(), dynamics)
+    plant.Finalize()
+    layout = make_machine_layout(plant, scene_graph, machine, 2.0, 0.3)
+    engine = make_engine(
+        heap, shapes, config=dynamics.nonsmooth, pieces=layout.pieces, n_machine_bodies=len(layout.bodies)
+    )
+    inspector = scene_graph.model_inspector()
+
+    def get_softness(geometry):
+        return 1.0 / inspector.GetProximityProperties(geometry).GetProperty(
+            "material", "point_contact_stiffness"
+        )
+
+    rocks, still, bodies = np.split(engine.softness, [len(heap), len(heap) + 1])
+    assert rocks == pytest.approx([get_softness(geometry) for geometry in geometries])
+    assert still == 0.0
+    for softness, name in zip(bodies, layout.bodies, strict=True):
+        body = plant.GetBodyByName(name, machine.instance)
+        assert softness == get_softness(plant.GetCollisionGeometriesForBody(body)[0])
