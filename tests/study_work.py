@@ -18,7 +18,7 @@ import numpy as np
 from drakerock.config import calc_config_hash
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.files import write_text
-from drakerock.loading.cycle import CycleOutcome
+from drakerock.loading.outcome import CycleOutcome
 from drakerock.randomness import make_generator
 
 DURATION = float(os.environ.get("STUDY_WORK_SECONDS", "0.05"))

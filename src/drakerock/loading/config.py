@@ -116,6 +116,29 @@ class PerformanceConfig(Config):
     event_time: Annotated[float, Field(ge=0, description="shortest stall or slip that counts [s]")] = 0.2
 
 
+class PartConfig(Config):
+    """A part of one's own in place of ours."""
+
+    system: Annotated[
+        str | None,
+        Field(
+            pattern=r"^[\w./-]+:\w+$",
+            description="module:function or file.py:function that makes it; null: ours",
+        ),
+    ] = None
+    parameters: dict[str, float | int | bool | str] = Field(
+        default={}, description="what the function gets by name; numbers can be a study's variables"
+    )
+
+
+class PartsConfig(Config):
+    """Controller, planner and sensor of one's own (`drakerock.loading.parts`)."""
+
+    controller: PartConfig = PartConfig()
+    planner: PartConfig = PartConfig()
+    sensor: PartConfig = PartConfig()
+
+
 class LoadingConfig(Config):
     """Everything about one loading cycle but machine, site and rocks."""
 
@@ -124,3 +147,4 @@ class LoadingConfig(Config):
     planning: PlanningConfig = PlanningConfig()
     control: ControlConfig = ControlConfig()
     performance: PerformanceConfig = PerformanceConfig()
+    parts: PartsConfig = PartsConfig()

@@ -10,7 +10,8 @@ import numpy as np
 from drakerock.config import calc_config_hash
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.files import make_folder
-from drakerock.loading.cycle import CycleOutcome, CycleResult, run_cycle, save_cycle
+from drakerock.loading.cycle import CycleResult, run_cycle, save_cycle
+from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.randomness import make_generator
 from drakerock.rocks.making.settling import fetch_pile, refill

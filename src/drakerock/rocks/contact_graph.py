@@ -16,7 +16,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from drakerock.rocks.drake.assembly import make_convex, make_pose
+from drakerock.rocks.drake.drift import make_convex
+from drakerock.rocks.drake.poses import make_pose
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.state import PileState
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from drakerock.exploration.noise import calc_standard_error
 from drakerock.files import make_folder, write_text
-from drakerock.loading.cycle import CycleOutcome, run_cycle, save_cycle
+from drakerock.loading.cycle import run_cycle, save_cycle
+from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.recording import load_recording
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.loading.sequence import run_sequence

@@ -40,7 +40,7 @@ from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.problem import Array
 from drakerock.exploration.table import ResponseTable, average_loadings
 from drakerock.files import make_folder, write_text
-from drakerock.loading.cycle import CycleOutcome
+from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario
 from drakerock.study.objectives import get_objective
 from drakerock.study.schema import StudyConfig

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 from drakerock.errors import InputError
-from drakerock.loading.cycle import CycleOutcome
+from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario
 from drakerock.study.store import get_versions, read_outcome
 

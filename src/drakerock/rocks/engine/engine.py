@@ -24,9 +24,9 @@ from drakerock.rocks.engine.compiling import announce_compilation
 from drakerock.rocks.engine.config import NonsmoothConfig
 from drakerock.rocks.engine.lanes import make_zeros
 from drakerock.rocks.engine.solver import MachineArrays
+from drakerock.rocks.engine.surroundings import Surroundings
 from drakerock.rocks.materials import calc_spring_stiffness
 from drakerock.rocks.shapes import RockShape
-from drakerock.rocks.site import Site
 from drakerock.rocks.state import ContactMemory, PileState
 
 Array = NDArray[np.float64]
@@ -35,11 +35,12 @@ IntArray = NDArray[np.int64]
 Grid = tuple[IntArray, Array, Array, float, IntArray, IntArray, float]
 _log = logging.getLogger(__name__)
 
-GRAVITY = 9.81
+# Drake's default [m/s^2].
+GRAVITY = (0.0, 0.0, -9.81)
+# Where there is no gravity, impulses are measured by this [m/s^2].
+STANDARD_GRAVITY = 9.81
 # Of `RockArrays`, what changes of awake rocks only.
 MOTION = ("positions", "quaternions", "velocities")
-# How far outside the site's box a rock still counts as inside [m].
-SITE_MARGIN = 0.5
 # A step that failed is solved again with this many times the iterations and without momentum, from a cold start if need
 # be; one that begins with an overlap beyond this share of the bound has as many at once. A light rock that the machine
 # presses into a jammed pile passes on little of the machine's momentum per iteration, and is squeezed meanwhile.
@@ -155,6 +156,24 @@ class StepReport:
         return len(self.awake)
 
 
+@dataclass(frozen=True, eq=False)
+class ContactTable:
+    """Contact points that carry load (c points).
+
+    Attributes:
+        first, second: (c,) the bodies in the engine's order: rocks, static pieces, half-spaces, pieces of machines.
+        points: (c, 3) in W [m].
+        impulses: (c, 3) on the second over the step, in W [N s].
+        gaps: (c,) at its beginning [m].
+    """
+
+    first: IntArray
+    second: IntArray
+    points: Array
+    impulses: Array
+    gaps: Array
+
+
 def make_machineless_step() -> MachineStep:
     """Return the machine of a simulation without one."""
     return MachineStep(
@@ -174,25 +193,25 @@ def make_machineless_step() -> MachineStep:
 
 
 class NonsmoothEngine:
-    """Steps a given set of rocks on a given site, with the pieces of a machine if there is one.
+    """Steps a given set of rocks in given surroundings, with the pieces of a machine if there is one.
 
     Args:
         rocks: material.
-        shapes: the scenario's rock shapes.
-        site: planes and convex pieces.
+        shapes: the rock shapes.
+        surroundings: what is at rest.
         config: settings.
         time_step: [s].
         shape, size, fixed: (n,) of the rocks, as in a `PileState`.
         pieces: the machine's.
         n_machine_bodies: number of machine bodies.
-        gravity: [m/s^2], along -z.
+        gravity: (3,) in W [m/s^2].
     """
 
     def __init__(
         self,
         rocks: RocksConfig,
         shapes: Sequence[RockShape],
-        site: Site,
+        surroundings: Surroundings,
         config: NonsmoothConfig,
         time_step: float,
         shape: IntArray,
@@ -200,7 +219,7 @@ class NonsmoothEngine:
         fixed: NDArray[np.bool_],
         pieces: Sequence[MachinePiece] = (),
         n_machine_bodies: int = 0,
-        gravity: float = GRAVITY,
+        gravity: Sequence[float] = GRAVITY,
     ) -> None:
         announce_compilation()
         self.config = config
@@ -209,15 +228,19 @@ class NonsmoothEngine:
         self.shape_index = np.asarray(shape, np.int64)
         self.size = np.asarray(size, float)
         self.fixed = np.asarray(fixed, bool)
-        self.gravity = gravity
-        n_shapes, n_static, n_planes = len(shapes), len(site.pieces), len(site.planes)
+        self.gravity = np.asarray(gravity, float)
+        # What impulses are measured by.
+        self._strength = float(np.linalg.norm(self.gravity)) or STANDARD_GRAVITY
+        n_shapes, n_static, n_planes = (
+            len(shapes), len(surroundings.pieces), len(surroundings.half_spaces),
+        )  # fmt: skip
         self.convex = make_convex_shapes(
             [item.vertices for item in shapes]
-            + [item.vertices for item in site.pieces]
+            + [item.vertices for item in surroundings.pieces]
             + [item.vertices for item in pieces],
             [config.rounding] * n_shapes + [0.0] * (n_static + len(pieces)),
         )
-        self.planes = np.array([[*plane.normal, plane.offset] for plane in site.planes], float).reshape(-1, 4)
+        self.planes = surroundings.half_space_array
 
         # Bodies: rocks, static pieces, planes, pieces of the machine.
         self.first_plane = n + n_static
@@ -232,8 +255,10 @@ class NonsmoothEngine:
         shape[self.first_piece :] = n_shapes + n_static + np.arange(len(pieces))
         scale = np.ones(n_bodies)
         scale[:n] = self.size
-        friction = np.full(n_bodies, site.config.friction)
+        friction = np.empty(n_bodies)
         friction[:n] = rocks.friction
+        friction[n : self.first_plane] = [piece.friction for piece in surroundings.pieces]
+        friction[self.first_plane : self.first_piece] = [plane.friction for plane in surroundings.half_spaces]
         friction[self.first_piece :] = [piece.friction for piece in pieces]
         solver_body = np.full(n_bodies, n, np.int64)
         solver_body[:n] = np.arange(n)
@@ -270,7 +295,7 @@ class NonsmoothEngine:
         else:
             self.softness[:n] = 1.0 / self.size
 
-        self._lower_site, self._upper_site = _calc_site_box(site)
+        self._lower_site, self._upper_site = surroundings.lower, surroundings.upper
         self._grids = _make_grid_classes(self.radius)
         self._make_scratch(n_bodies)
 
@@ -488,6 +513,20 @@ class NonsmoothEngine:
             )
         return again, _mark_redone(better)
 
+    def find_loaded_contacts(self, arrays: RockArrays, machine: MachineStep) -> ContactTable:
+        """Return the contact points that carry load in the coming step; arguments and errors as of `step`."""
+        _, report = self.step(arrays, machine)
+        rows, n_rows = self._rows, report.n_contacts
+        values = rows.values[:n_rows]
+        loaded = values[:, contacts.IMPULSE] > 0.0
+        values, keys = values[loaded], rows.key[:n_rows][loaded]
+        first, second = keys // contacts.KEY_STEP, keys % contacts.KEY_STEP
+        axes = values[:, contacts.NORMAL : contacts.NORMAL + 9].reshape(-1, 3, 3)
+        impulses = np.einsum("kij,ki->kj", axes, values[:, contacts.IMPULSE : contacts.IMPULSE + 3])
+        # A row's arms are from where the bodies were when the step began.
+        points = arrays.positions[first] + values[:, contacts.ARM_A : contacts.ARM_A + 3]
+        return ContactTable(first, second, points, impulses, values[:, contacts.GAP].copy())
+
     def write_changes(self, new: RockArrays, report: StepReport, target: RockArrays) -> None:
         """Write what a step has changed into a copy of the state before it.
 
@@ -532,7 +571,7 @@ class NonsmoothEngine:
                 arrays.n_idle,
                 machine.sensors,
                 self._by_movers,
-                config.rest.wake_load * self.gravity * dt,
+                config.rest.wake_load * self._strength * dt,
                 config.rest.wake_share,
                 config.rest.wake_near_movers,
                 config.rest.wake_steps,
@@ -583,12 +622,12 @@ class NonsmoothEngine:
             )  # fmt: skip
         if config.spin_damping > 0.0:
             solver.damp_spin(rows, n_rows, body_a, body_b, self._bodies, n, config.spin_damping * dt)
-        motion.add_gravity(awake, self._bodies, np.array([0.0, 0.0, -self.gravity * dt]))
+        motion.add_gravity(awake, self._bodies, self.gravity * dt)
         velocity += machine.free_change
         residual = resting.solve_resting(
             rows, n_rows, body_a, body_b, awake, self._bodies, n, machine.arrays, velocity,
             iterations, config.machine_sweeps, momentum, self._batches, self._bodies_32, self._marks,
-            float(self.mass[awake].sum()) * self.gravity * dt,
+            float(self.mass[awake].sum()) * self._strength * dt,
         )  # fmt: skip
 
         sane = motion.move(
@@ -773,16 +812,6 @@ def _calc_percentile(values: Array, share: float) -> float:
         return 0.0
     place = min(int(share * len(values)), len(values) - 1)
     return float(np.partition(values, place)[place])
-
-
-def _calc_site_box(site: Site) -> tuple[Array, Array]:
-    """Return the corners of the box outside of which a rock has left the site [m]."""
-    config = site.config
-    half = 0.5 * config.drift_width + SITE_MARGIN
-    return (
-        np.array([-config.drift_length, -half, -SITE_MARGIN]),
-        np.array([config.void_depth + SITE_MARGIN, half, config.void_height + 20.0]),
-    )
 
 
 def _make_grid_classes(radius: Array) -> list[tuple[IntArray, float]]:

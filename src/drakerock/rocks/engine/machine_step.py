@@ -30,14 +30,17 @@ JOINT_LOWER = 4
 JOINT_UPPER = 5
 JOINT_WIDTH = 6
 
-# Columns of a contact of a machine body with the site.
+# Columns of a contact of the plant's own, of a body with the world or with another body.
 SITE_BODY = 0
-SITE_NORMAL = 1  # 1..3 unit normal in W, out of the site
+SITE_NORMAL = 1  # 1..3 unit normal in W, into the body
 SITE_POINT = 4  # 4..6 in W
 SITE_DEPTH = 7
 SITE_STIFFNESS = 8
 SITE_FRICTION = 9
-SITE_WIDTH = 10
+SITE_OTHER = 10  # the other body, NO_BODY: the world
+SITE_WIDTH = 11
+
+NO_BODY = -1
 
 # Of the linkage's closed loops, as a share of the mobility they take away.
 LOOP_COMPLIANCE = 1e-10
@@ -151,6 +154,8 @@ def _set_site_rows(
                 + ay * jacobian[body, 4, d]
                 + az * jacobian[body, 5, d]
             )
+        if contact[SITE_OTHER] != NO_BODY:
+            _subtract_other(contact, jacobian, origins, ax, ay, az, rows[first + k])
     depth, stiffness, mu = contact[SITE_DEPTH], contact[SITE_STIFFNESS], contact[SITE_FRICTION]
     values[first, TARGET] = depth / time_step
     values[first, ROW_COMPLIANCE] = 1.0 / (time_step * time_step * stiffness)
@@ -160,3 +165,24 @@ def _set_site_rows(
         values[k, ROW_COMPLIANCE] = stiction_tolerance / (mu * time_step * stiffness * depth)
         values[k, LOWER], values[k, UPPER] = -mu, mu
         values[k, NORMAL_ROW] = first
+
+
+@kernel
+def _subtract_other(
+    contact: Array, jacobian: Array, origins: Array, ax: float, ay: float, az: float, row: Array
+) -> None:
+    """Subtract the other body's velocity at the contact along an axis."""
+    other = int(contact[SITE_OTHER])
+    x = contact[SITE_POINT] - origins[other, 0]
+    y = contact[SITE_POINT + 1] - origins[other, 1]
+    z = contact[SITE_POINT + 2] - origins[other, 2]
+    turning = (y * az - z * ay, z * ax - x * az, x * ay - y * ax)
+    for d in range(len(row)):
+        row[d] -= (
+            turning[0] * jacobian[other, 0, d]
+            + turning[1] * jacobian[other, 1, d]
+            + turning[2] * jacobian[other, 2, d]
+            + ax * jacobian[other, 3, d]
+            + ay * jacobian[other, 4, d]
+            + az * jacobian[other, 5, d]
+        )

@@ -21,8 +21,10 @@ from drakerock.randomness import make_generator
 from drakerock.resources import find_data
 from drakerock.rocks.config import PileConfig, RocksConfig, SiteConfig
 from drakerock.rocks.contact_graph import find_loose
-from drakerock.rocks.drake.assembly import add_plant, add_site
-from drakerock.rocks.drake.plant_engine import add_plant_rocks, add_rock_bodies
+from drakerock.rocks.drake.add_rocks import AddRocks
+from drakerock.rocks.drake.drift import AddDrift
+from drakerock.rocks.drake.plant import add_plant
+from drakerock.rocks.drake.plant_engine import AddRockBodies
 from drakerock.rocks.engine.config import DynamicsConfig
 from drakerock.rocks.engine.engine import NonsmoothEngine
 from drakerock.rocks.making.emission import (
@@ -36,7 +38,7 @@ from drakerock.rocks.making.emission import (
 )
 from drakerock.rocks.ordering import order_by_place
 from drakerock.rocks.shapes import RockShape, load_rock_shapes
-from drakerock.rocks.site import Site, make_confined_site, make_site
+from drakerock.rocks.site import Site, make_confined_site, make_site, make_surroundings
 from drakerock.rocks.state import PileState, load_pile, make_empty_pile, save_pile
 from drakerock.rocks.summary import calc_imbalance, calc_support
 
@@ -158,12 +160,12 @@ def calc_creep(
 def _make_plant_advance(
     pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe, site: Site
 ) -> Callable[[float], PileState]:
-    builder = DiagramBuilder()
-    plant, _ = add_plant(builder, recipe.dynamics)
-    add_site(plant, site, recipe.dynamics)
-    geometries = add_rock_bodies(plant, pile, shapes, recipe.rocks, recipe.dynamics)
+    builder, dynamics = DiagramBuilder(), recipe.dynamics
+    plant, scene_graph = add_plant(builder, dynamics)
+    AddDrift(plant, site, dynamics.plant)
+    bodies = AddRockBodies(plant, pile, recipe.rocks, dynamics.plant, dynamics.reference_overlap, shapes)
     plant.Finalize()
-    rocks = add_plant_rocks(builder, plant, pile, geometries)
+    rocks = AddRocks(builder, plant, scene_graph, pile, recipe.rocks, engine=bodies)
     simulator = Simulator(builder.Build())
     root = simulator.get_mutable_context()
     rocks.set_pile(root, pile)
@@ -179,7 +181,7 @@ def _make_nonsmooth_advance(
     pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe, site: Site
 ) -> Callable[[float], PileState]:
     engine = NonsmoothEngine(
-        recipe.rocks, shapes, site, recipe.dynamics.nonsmooth, recipe.dynamics.time_step,
+        recipe.rocks, shapes, make_surroundings(site), recipe.dynamics.nonsmooth, recipe.dynamics.time_step,
         pile.shape, pile.size, pile.fixed,
     )  # fmt: skip
     arrays = engine.make_arrays(pile)
