@@ -326,6 +326,7 @@ def continue_dig(
     with go_on_with(simulator, rocks, settings) as other:
         root = other.get_mutable_context()
         context = rocks.GetMyContextFromRoot(root)
+        bucket_force = rocks.get_body_force_output_port(plant.GetBodyByName("bucket").index())
         tip = plant.GetFrameByName("tip")
         plant_context = plant.GetMyContextFromRoot(root)
         before, masses = rocks.get_pile(root), rocks.engine.mass
@@ -333,7 +334,7 @@ def continue_dig(
         forces, start, cpu = [], root.get_time(), time.process_time()
         for k in range(round(STATE_TIME / TIME_STEP)):
             other.AdvanceTo(start + (k + 1) * TIME_STEP)
-            forces.append(-rocks.GetOutputPort("F_B_W").Eval(context)[3] / 1e3)
+            forces.append(-bucket_force.Eval(context)[3] / 1e3)
         cpu = time.process_time() - cpu
         after = rocks.get_pile(root)
         way = np.linalg.norm(after.p_WRs - before.p_WRs, axis=1)

@@ -20,12 +20,13 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
-from drakerock.lhd.geometry import collision_pieces, find_pads, make_bucket_geometry
+from drakerock.lhd.geometry import collision_pieces, make_bucket_geometry
 from drakerock.lhd.hinge import add_hinge_moment
 from drakerock.lhd.kinematics import make_kinematics
 from drakerock.lhd.measurement import add_machine_sensor
-from drakerock.lhd.model import Machine, add_machine, calc_motor_targets, find_ball_constraints
+from drakerock.lhd.model import Machine, add_machine, calc_motor_targets
 from drakerock.lhd.placement import set_machine_pose
+from drakerock.lhd.rocks import add_lhd_rocks
 from drakerock.loading.control import FeedforwardController
 from drakerock.loading.field import HeightField
 from drakerock.loading.parts import MakePart, StationView, connect_inputs, make_part
@@ -35,15 +36,12 @@ from drakerock.loading.planning import DiggingMachine, DigPlanner
 from drakerock.loading.scenario import Scenario
 from drakerock.loading.segments import SegmentTracker
 from drakerock.loading.sensing import PileSensor
-from drakerock.rocks.drake.add_rocks import AddRocks
 from drakerock.rocks.drake.drift import AddDrift
 from drakerock.rocks.drake.interface import RockSystem
 from drakerock.rocks.drake.plant import add_plant
 from drakerock.rocks.drake.plant_engine import AddRockBodies
-from drakerock.rocks.drake.plant_view import WakeBox
-from drakerock.rocks.engine.config import RestConfig
 from drakerock.rocks.shapes import RockShape, load_rock_shapes
-from drakerock.rocks.site import Site, calc_bounds, make_site
+from drakerock.rocks.site import Site, make_site
 from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
@@ -186,21 +184,10 @@ def make_station(
     builder.Connect(
         motors.GetOutputPort("desired_state"), plant.get_desired_state_input_port(machine.instance)
     )
-    rocks = AddRocks(
-        builder,
-        plant,
-        scene_graph,
-        pile,
-        scenario.rocks,
-        engine=bodies or dynamics.nonsmooth,
-        shapes=shapes,
-        bounds=calc_bounds(scenario.site),
-        wake_boxes=[_make_wake_box(plant, scene_graph, machine, dynamics.nonsmooth.rest)],
-        loops=find_ball_constraints(plant, machine),
-        ignored=find_pads(plant, scene_graph, machine),
-        stiction_tolerance=dynamics.stiction_tolerance,
-        visible=visible,
-    )
+    rocks = add_lhd_rocks(
+        builder, plant, scene_graph, machine, pile, scenario.rocks, dynamics, scenario.site,
+        shapes=shapes, bodies=bodies, visible=visible,
+    )  # fmt: skip
     machine_sensor = add_machine_sensor(builder, plant, machine, digger.kinematics)
     hinge = add_hinge_moment(builder, plant, machine)
 
@@ -307,17 +294,6 @@ def _make_planner(view: StationView) -> DigPlanner:
         loading.control.speed_floor,
         stored=None if source is None else load_plan(source)[0],
     )
-
-
-def _make_wake_box(
-    plant: MultibodyPlant, scene_graph: SceneGraph, machine: Machine, rest: RestConfig
-) -> WakeBox:
-    """Return the method's refinement sensor: in front of the bucket, and a margin around it."""
-    pieces = collision_pieces(plant, scene_graph, machine)["bucket"]
-    corners = np.vstack([piece.vertices for piece in pieces])
-    lower, upper = corners.min(axis=0) - rest.sensor_margin, corners.max(axis=0) + rest.sensor_margin
-    upper[0] = corners[:, 0].max() + rest.sensor_length
-    return WakeBox(plant.GetBodyByName("bucket", machine.instance).index(), lower, upper)
 
 
 def _calc_machine_width(plant: MultibodyPlant, scene_graph: SceneGraph, machine: Machine) -> float:

@@ -212,7 +212,7 @@ def test_pieces_are_convex_and_carry_friction(model):
     for body, parts in pieces.items():
         mu = 0.9 if body in names.WHEELS else 1.125
         for piece in parts:
-            assert piece.mu == mu
+            assert piece.material.friction == mu
             assert piece.vertices.shape[1] == 3
             hull = trimesh.convex.convex_hull(piece.vertices)
             assert hull.volume > 1e-3

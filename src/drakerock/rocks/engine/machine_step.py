@@ -1,4 +1,4 @@
-"""The machine over a step as the contact solve sees it: inertia, closed loops and rows (see `coupling`).
+"""The machine over a step as the contact solve sees it: inertia, closed loops and rows (see `rocks.drake.plant_view`).
 
 Products of whole matrices are numpy's: a few of them take no time in a step, but seconds each to compile.
 """
@@ -133,7 +133,7 @@ def _set_site_rows(
     rows: Array,
     values: Array,
 ) -> None:
-    """Set the rows of a contact from `first` on, a normal one and two of friction: Drake's laws, see `coupling`."""
+    """Set the rows of a contact from `first` on, a normal one and two of friction: Drake's laws, see `plant_view`."""
     body = int(contact[SITE_BODY])
     nx, ny, nz = contact[SITE_NORMAL], contact[SITE_NORMAL + 1], contact[SITE_NORMAL + 2]
     tx, ty, tz, ux, uy, uz = make_tangents(nx, ny, nz)

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.rocks.config import RocksConfig
 from drakerock.rocks.drake.interface import ROCK_SUMMARY
-from drakerock.rocks.drake.system import NonsmoothRocks
 from drakerock.rocks.engine import contacts, motion, reduction, solver
 from drakerock.rocks.engine import engine as engine_module
 from drakerock.rocks.engine.collision import gjk
@@ -33,6 +32,7 @@ from rock_helpers import (
     make_machine_step,
     make_pile,
     make_plane_site,
+    make_rock_diagram,
     make_shape,
     run,
 )
@@ -412,14 +412,14 @@ def test_changes_written_into_a_copy_are_the_whole_state():
 def test_two_contexts_keep_their_solutions_apart():
     """The solution of a context is not lost when that of its clone is found."""
     pile = draw_pile(3, 20)
-    system = NonsmoothRocks(make_engine(pile, SHAPES, make_plane_site(planes=5)), pile)
-    one = system.CreateDefaultContext()
+    diagram, system = make_rock_diagram(pile, SHAPES, make_plane_site(planes=5))
+    one = diagram.CreateDefaultContext()
     first = system.get_report(one)
     other = one.Clone()
     shifted = replace(pile, p_WRs=pile.p_WRs + [0.0, 0.0, 1.0])
     system.set_pile(other, shifted)
     assert system.get_report(other) != first
-    simulator = Simulator(system, one)
+    simulator = Simulator(diagram, one)
     simulator.AdvanceTo(0.01)
     expected, _ = run(system.engine, system.engine.make_arrays(pile), 0.01)
     assert np.array_equal(system.get_pile(simulator.get_context()).p_WRs, expected.positions)
@@ -702,20 +702,23 @@ def test_a_site_without_rocks_steps():
 def test_the_system_runs_without_a_machine_and_steps_as_the_engine_does():
     pile = draw_pile(0, 20)
     engine = make_engine(pile, SHAPES, make_plane_site(planes=5))
-    system = NonsmoothRocks(engine, pile)
-    simulator = Simulator(system)
+    diagram, system = make_rock_diagram(pile, SHAPES, make_plane_site(planes=5))
+    simulator = Simulator(diagram)
     simulator.AdvanceTo(0.5)
     expected, _ = run(engine, engine.make_arrays(pile), 0.5)
     actual = system.get_pile(simulator.get_context())
     assert np.array_equal(actual.p_WRs, expected.positions)
-    poses = system.GetOutputPort("rock_poses").Eval(simulator.get_context()).reshape(-1, 7)
-    assert np.array_equal(poses, np.hstack([expected.quaternions, expected.positions]))
-    velocities = system.GetOutputPort("rock_velocities").Eval(simulator.get_context())
-    assert np.array_equal(velocities.reshape(-1, 6), expected.velocities)
-    summary = system.GetOutputPort("rock_summary").Eval(simulator.get_context())
+    context = system.GetMyContextFromRoot(simulator.get_context())
+    shown = system.GetOutputPort("pile").Eval(context)
+    assert np.array_equal(shown.p_WRs, expected.positions)
+    assert np.array_equal(shown.q_WRs, expected.quaternions)
+    assert np.array_equal(shown.V_WRs, expected.velocities)
+    summary = system.GetOutputPort("summary").Eval(context)
     assert summary[list(ROCK_SUMMARY).index("n_awake")] == len(pile)
-    assert not system.GetOutputPort("F_B_W").Eval(simulator.get_context()).any()
-    assert not system.GetOutputPort("rock_status").Eval(simulator.get_context()).any()
+    assert not any(
+        force.get_coeffs().any() for force in system.GetOutputPort("body_spatial_forces").Eval(context)
+    )
+    assert not system.GetOutputPort("status").Eval(context).any()
 
 
 @given(
