@@ -12,8 +12,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from drakerock.config import calc_config_hash
 from drakerock.exploration.table import ResponseTable
+from drakerock.identity import calc_config_hash
 from drakerock.resources import find_data
 from drakerock.study.runner import run_study
 from drakerock.study.schema import load_study

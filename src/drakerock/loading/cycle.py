@@ -6,7 +6,6 @@ import json
 import time as clock
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,9 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context, EventStatus
 
-import drakerock
-from drakerock.config import calc_config_hash
 from drakerock.errors import SimulationFailure
 from drakerock.files import make_folder, write_text
+from drakerock.identity import calc_config_hash, get_versions
 from drakerock.lhd.placement import set_machine_pose
 from drakerock.loading.control import TIMEOUTS, WAYPOINT_TIMES, Mode
 from drakerock.loading.field import HeightField
@@ -436,6 +434,6 @@ def _make_outcome(
         ms_per_step=1e3 * wall_time / max(steps, 1),
         files={"planned_tip_path": "plan.json", "actual_tip_path": "signals.parquet"},
         seed=scenario.seed,
-        versions={"drakerock": drakerock.__version__, "drake": version("drake")},
+        versions=get_versions(),
         scenario_hash=calc_config_hash(scenario),
     )

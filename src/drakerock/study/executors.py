@@ -262,7 +262,7 @@ def _connect(address: str) -> DaskExecutor:
     try:
         client = Client(address, timeout=10, name="drakerock")
     except (OSError, TimeoutError, ValueError) as error:
-        raise InputError(f"--scheduler {address}: no Dask scheduler there: {error}") from None
+        raise InputError(f"{address}: no Dask scheduler there: {error}") from None
     return DaskExecutor(f"Dask scheduler {address}", client)
 
 

@@ -15,10 +15,11 @@ from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.noise import calc_autocorrelation, calc_standard_error
 from drakerock.exploration.problem import Array
 from drakerock.files import make_folder
+from drakerock.identity import get_versions
 from drakerock.study.executors import Executor, WorkerLost, make_executor
 from drakerock.study.objectives import get_objective
 from drakerock.study.runner import RUN_SEQUENCE, catch_signals
-from drakerock.study.store import Store, calc_inputs_hash, get_versions, read_outcome
+from drakerock.study.store import Store, calc_inputs_hash, read_outcome
 from drakerock.study.work import Task, TaskResult, run_task
 
 _POLL = 0.5

@@ -19,11 +19,12 @@ from typing import Any
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.problem import Array
 from drakerock.exploration.sampling import make_sampler, make_validation_points
+from drakerock.identity import get_versions
 from drakerock.rocks.engine.compiling import are_kernels_compiled, describe_compilation
 from drakerock.study.display import Display
 from drakerock.study.executors import Executor, WorkerLost, make_executor
 from drakerock.study.schema import StudyConfig
-from drakerock.study.store import Point, Store, export_tables, get_versions
+from drakerock.study.store import Point, Store, export_tables
 from drakerock.study.work import Task, TaskResult
 
 RUN_SEQUENCE = "drakerock.loading.sequence:run_sequence"

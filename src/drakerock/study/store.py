@@ -23,7 +23,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -34,12 +33,11 @@ import pyarrow.csv
 import pyarrow.parquet
 from pydantic import ValidationError
 
-import drakerock
-from drakerock.config import calc_config_hash
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.problem import Array
 from drakerock.exploration.table import ResponseTable, average_loadings
 from drakerock.files import make_folder, write_text
+from drakerock.identity import RESULTS_REVISION, calc_config_hash, describe_content, get_versions
 from drakerock.loading.cycle import CycleOutcome
 from drakerock.loading.scenario import Scenario
 from drakerock.study.objectives import get_objective
@@ -48,7 +46,7 @@ from drakerock.study.schema import StudyConfig
 DATABASE = "study.db"
 STUDY = "study.json"
 POINTS = "points"
-_SCHEMA_VERSION = 1
+_SCHEMA_VERSION = 2
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS points (
@@ -148,12 +146,14 @@ class Store:
                 )
             db = _connect(folder / DATABASE)
             stored = db.execute("SELECT value FROM meta WHERE key = 'identity'").fetchone()
-            if stored and stored[0] != study.calc_identity():
-                raise InputError(_describe_difference(folder, study))
+            wanted = _describe_identity(study)
+            if stored and json.loads(stored[0]) != wanted:
+                raise InputError(_describe_difference(folder, json.loads(stored[0]), wanted))
             _write_study(folder, study)
             store = cls(folder, study, db, lock)
             with store.transaction():
-                db.execute("INSERT OR IGNORE INTO meta VALUES ('identity', ?)", (study.calc_identity(),))
+                db.execute("INSERT OR IGNORE INTO meta VALUES ('identity', ?)", (json.dumps(wanted),))
+                db.execute("INSERT OR IGNORE INTO meta VALUES ('study', ?)", (_write_neutral(study),))
                 db.execute("UPDATE runs SET ending = 'killed' WHERE ending = ''")
             return store
         except sqlite3.DatabaseError as error:
@@ -539,8 +539,9 @@ class Store:
             return [Fault("database", DATABASE, message) for message in messages]
         for row in self._db.execute("PRAGMA foreign_key_check"):
             faults.append(Fault("database", DATABASE, f"table {row[0]} has a row without its {row[2]}"))
-        (identity,) = self._db.execute("SELECT value FROM meta WHERE key = 'identity'").fetchone()
-        if identity != self.study.calc_identity():
+        # A store of an earlier version has none.
+        stored = self._db.execute("SELECT value FROM meta WHERE key = 'study'").fetchone()
+        if stored and stored[0] != _write_neutral(self.study):
             faults.append(Fault("mismatch", STUDY, "is not the study that the database was made for"))
         known, open_folders = set(), []
         for point, attempt, status in self._db.execute(
@@ -609,7 +610,7 @@ def export_tables(folder: str | Path, formats: Sequence[str] = ("csv", "parquet"
     paths = []
     for suffix in formats:
         if suffix not in ("csv", "parquet"):
-            raise InputError(f"--format {suffix}: csv or parquet")
+            raise InputError(f"format {suffix}: csv or parquet")
         for name in ("responses", "loadings"):
             path = Path(folder) / f"{name}.{suffix}"
             partial = path.with_name(f".partial-{path.name}")
@@ -649,15 +650,7 @@ def calc_checksums(folder: Path, keep: str) -> dict[str, str]:
 
 def calc_inputs_hash(scenario: Scenario, n_loadings: int) -> str:
     """Return the hash of all that a sequence's outcomes depend on: scenario, seed, loadings, versions."""
-    versions = get_versions()
-    return calc_config_hash(scenario, str(n_loadings), versions["drakerock"], versions["drake"])
-
-
-def get_versions() -> dict[str, str]:
-    """Return the versions that results depend on."""
-    return {"drakerock": drakerock.__version__} | {
-        name: version(name) for name in ("drake", "numba", "numpy")
-    }
+    return calc_config_hash(scenario, str(n_loadings), *get_versions().values())
 
 
 def _connect(path: Path, make: bool = True) -> sqlite3.Connection:
@@ -666,6 +659,11 @@ def _connect(path: Path, make: bool = True) -> sqlite3.Connection:
         (found,) = db.execute("PRAGMA user_version").fetchone()
         if found > _SCHEMA_VERSION:
             raise InputError(f"{path}: made by a newer version (format {found}, not {_SCHEMA_VERSION})")
+        if make and 0 < found < _SCHEMA_VERSION:
+            raise InputError(
+                f"{path}: made by an earlier version (format {found}, not {_SCHEMA_VERSION}), whose results do not "
+                "mix with this one's; take another folder"
+            )
         if found == 0:
             (tables,) = db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
             if tables or not make:
@@ -698,19 +696,22 @@ def _write_study(folder: Path, study: StudyConfig) -> None:
     write_text(folder / STUDY, json.dumps(data, indent=2) + "\n")
 
 
-def _describe_difference(folder: Path, study: StudyConfig) -> str:
-    try:
-        stored = read_study(folder).model_dump(mode="json")
-    except InputError:
-        stored = {}
-    wanted = study.model_dump(mode="json")
-    differs = [
-        key for key in _list_differences(stored, wanted) if not key.startswith(("executor", "storage"))
-    ]
+def _describe_identity(study: StudyConfig) -> dict[str, Any]:
+    """Return all that a study's results depend on: of files their content, and the results revision."""
+    return {"results revision": RESULTS_REVISION} | describe_content(study.make_neutral())
+
+
+def _write_neutral(study: StudyConfig) -> str:
+    """Return the same as it stands in the study, with the files' names."""
+    return json.dumps(study.make_neutral().model_dump(mode="json"), sort_keys=True)
+
+
+def _describe_difference(folder: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> str:
+    differs = _list_differences(stored, wanted)
     shown = ", ".join(differs[:5]) + (", ..." if len(differs) > 5 else "")
     return (
-        f"--out {folder}: holds another study (different: {shown or 'unknown'}); take another folder, or the same "
-        "study. The number of points, the executor and the storage may change."
+        f"{folder}: holds another study (different: {shown}); take another folder, or the same study. The number of "
+        "points, the executor and the storage may change; of files the content counts."
     )
 
 

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 from drakerock.errors import InputError
+from drakerock.identity import get_versions
 from drakerock.loading.cycle import CycleOutcome
 from drakerock.loading.scenario import Scenario
-from drakerock.study.store import get_versions, read_outcome
+from drakerock.study.store import read_outcome
 
 _DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
