@@ -267,11 +267,12 @@ def study_status(folder: StudyFolder, json_: JsonOption = False) -> None:
 
     Example: drakerock study status out/smoke
     """
+    from drakerock.study.db import Store
     from drakerock.study.display import make_status_table
-    from drakerock.study.store import Store
+    from drakerock.study.status import read_status
 
     with Store.open(folder) as store:
-        status = store.read_status()
+        status = read_status(store)
     if json_:
         print(json.dumps(status))
     else:
@@ -287,7 +288,7 @@ def study_export(
 
     Example: drakerock study export out/smoke --format parquet
     """
-    from drakerock.study.store import export_tables
+    from drakerock.study.tables import export_tables
 
     _print_paths(export_tables(folder, [format_]))
 
@@ -298,10 +299,11 @@ def study_verify(folder: StudyFolder, json_: JsonOption = False) -> None:
 
     Example: drakerock study verify out/smoke
     """
-    from drakerock.study.store import Store
+    from drakerock.study.db import Store
+    from drakerock.study.verify import verify_store
 
     with Store.open(folder) as store:
-        faults = store.verify()
+        faults = verify_store(store)
     if json_:
         print(json.dumps([vars(fault) for fault in faults]))
     else:

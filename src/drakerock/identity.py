@@ -7,6 +7,7 @@ import json
 import re
 from functools import lru_cache
 from importlib.metadata import version
+from os.path import normpath
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ def calc_file_hash(name: str) -> str:
 
 def _add_file(digest: Any, name: str, folder: Path, known: set[Path]) -> None:
     try:
-        path = (folder / find_file(name)).resolve()
+        path = Path(normpath(folder / find_file(name)))
         if path in known:
             return
         known.add(path)

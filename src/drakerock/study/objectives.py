@@ -8,12 +8,15 @@ import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from drakerock.errors import InputError
 from drakerock.exploration.problem import Objective
-from drakerock.loading.cycle import CycleOutcome
 
-ObjectiveFunction = Callable[[CycleOutcome], float | None]
+if TYPE_CHECKING:  # the simulation takes seconds to import: only who runs it pays for that
+    from drakerock.loading.cycle import CycleOutcome
+
+ObjectiveFunction = Callable[["CycleOutcome"], float | None]
 """From the outcome of a finished cycle to the objective in its natural sense; None: no value."""
 
 

@@ -16,10 +16,11 @@ from drakerock.exploration.noise import calc_autocorrelation, calc_standard_erro
 from drakerock.exploration.problem import Array
 from drakerock.files import make_folder
 from drakerock.identity import get_versions
+from drakerock.study.db import Store, calc_inputs_hash, read_outcome
 from drakerock.study.executors import Executor, WorkerLost, make_executor
 from drakerock.study.objectives import get_objective
 from drakerock.study.runner import RUN_SEQUENCE, catch_signals
-from drakerock.study.store import Store, calc_inputs_hash, read_outcome
+from drakerock.study.tables import read_loadings
 from drakerock.study.work import Task, TaskResult, run_task
 
 _POLL = 0.5
@@ -51,7 +52,7 @@ class Resimulation:
     ) -> None:
         self._folder = Path(folder)
         with Store.open(self._folder) as store:
-            self._study, loadings = store.study, store.read_loadings()
+            self._study, loadings = store.study, read_loadings(store)
         self._functions = [get_objective(name) for name in self._study.objectives]
         # A single sequence knows its autocorrelation badly: that of the study's own sequences is taken.
         self._rho = []

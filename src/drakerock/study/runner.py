@@ -21,10 +21,12 @@ from drakerock.exploration.problem import Array
 from drakerock.exploration.sampling import make_sampler, make_validation_points
 from drakerock.identity import get_versions
 from drakerock.rocks.engine.compiling import are_kernels_compiled, describe_compilation
+from drakerock.study.db import Point, Store
 from drakerock.study.display import Display
 from drakerock.study.executors import Executor, WorkerLost, make_executor
 from drakerock.study.schema import StudyConfig
-from drakerock.study.store import Point, Store, export_tables
+from drakerock.study.status import read_status
+from drakerock.study.tables import export_tables, read_responses
 from drakerock.study.work import Task, TaskResult
 
 RUN_SEQUENCE = "drakerock.loading.sequence:run_sequence"
@@ -53,7 +55,7 @@ def run_study(
         work: the function that runs a sequence, as ``module:name``.
 
     Returns:
-        The status at the end (`Store.read_status`).
+        The status at the end (`read_status`).
 
     Raises:
         InputError: the folder holds another study, cannot be written, or is in use.
@@ -65,7 +67,7 @@ def run_study(
         try:
             runner.run(workers, scheduler)
         finally:
-            status = store.read_status()
+            status = read_status(store)
             if display:
                 display.update(status, last=True)
     export_tables(folder)
@@ -174,7 +176,7 @@ class _Runner:
         sampler = make_sampler(self._study.problem, config, self._study.seed)
         if n_samples == 0:
             return sampler.ask(min(len(sampler.initial), config.n_samples))
-        table = self._store.read_responses("sample")
+        table = read_responses(self._store, "sample")
         sampler.tell(table.X, table.Y, table.noise)
         # Of an initial design cut short by an earlier, smaller number of points, the rest comes first.
         left = len(sampler.initial) - n_samples
@@ -205,7 +207,7 @@ class _Runner:
             self._record(sequence)
         if self._display and time.monotonic() - self._shown > 1.0:
             self._shown = time.monotonic()
-            self._display.update(self._store.read_status())
+            self._display.update(read_status(self._store))
 
     def _record(self, sequence: _Sequence) -> None:
         task, now = sequence.task, time.monotonic()

@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from drakerock.config import Config, list_types, load_config
 from drakerock.errors import InputError
-from drakerock.exploration.analysis import ExplorationConfig
+from drakerock.exploration.config import ExplorationConfig
 from drakerock.exploration.problem import Array, Problem, Variable
 from drakerock.loading.scenario import Scenario
 from drakerock.randomness import derive_seed

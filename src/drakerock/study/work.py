@@ -17,7 +17,7 @@ from drakerock.errors import InputError
 from drakerock.identity import get_versions
 from drakerock.loading.cycle import CycleOutcome
 from drakerock.loading.scenario import Scenario
-from drakerock.study.store import read_outcome
+from drakerock.study.db import read_outcome
 
 _DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
