@@ -7,6 +7,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -381,15 +382,27 @@ def strategy(
     print(json.dumps(chosen.to_dict(), indent=2) if json_ else chosen.to_text())
 
 
-@study_app.command("schema")
-def study_schema() -> None:
-    """Print the JSON Schema of study files, for editors.
+class FileKind(StrEnum):
+    """Kinds of files that a schema describes."""
 
-    Example: drakerock study schema > study.schema.json
+    scenario = "scenario"
+    study = "study"
+
+
+@app.command()
+def schema(kind: Annotated[FileKind, typer.Argument(help="Which files.")]) -> None:
+    """Print the JSON Schema of scenario or study files, for editors.
+
+    Example: drakerock schema scenario > scenario.schema.json
+
+    Example: drakerock schema study > study.schema.json
     """
-    from drakerock.study.schema import make_json_schema
+    from drakerock.config import make_json_schema
+    from drakerock.loading.scenario import Scenario
+    from drakerock.study.schema import StudyConfig
 
-    print(json.dumps(make_json_schema(), indent=2))
+    described = Scenario if kind == FileKind.scenario else StudyConfig
+    print(json.dumps(make_json_schema(described, f"drakerock {kind}"), indent=2))
 
 
 def _load(path: Path | None, seed: int | None, overrides: list[str] | None) -> Any:

@@ -227,6 +227,24 @@ def _describe(item: Any, schema: type[BaseModel], origin: _Origin) -> str:
     return f"{where}: {name}{message}{shown if len(shown) < 120 else ''}"
 
 
+def make_json_schema(schema: type[Config], title: str) -> dict[str, Any]:
+    """Return the JSON Schema of a schema's YAML files, for editors.
+
+    Args:
+        schema: such as `Scenario`.
+        title: what to call it.
+    """
+    from pydantic.json_schema import GenerateJsonSchema  # takes a while to import, and few want it
+
+    class Generator(GenerateJsonSchema):
+        def str_schema(self, schema: Any) -> dict[str, Any]:
+            # As `validate` does: digits are text where text is expected.
+            return super().str_schema(schema) | {"type": ["string", "number"]}
+
+    body = schema.model_json_schema(schema_generator=Generator)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **body, "title": title}
+
+
 def list_types(annotation: Any, with_items: bool = False) -> set[Any]:
     """Return the types that a field may hold; with `with_items` also those of a tuple's items."""
     origin, arguments = get_origin(annotation), get_args(annotation)

@@ -11,7 +11,18 @@ import pytest
 import drakerock
 
 SOURCE = Path(drakerock.__file__).parent
-HEAVY = ("pydrake", "numba", "sklearn", "scipy", "trimesh", "openturns", "pymoo", "pyarrow", "distributed", "matplotlib")
+HEAVY = (
+    "pydrake",
+    "numba",
+    "sklearn",
+    "scipy",
+    "trimesh",
+    "openturns",
+    "pymoo",
+    "pyarrow",
+    "distributed",
+    "matplotlib",
+)
 
 
 def find_heavy(statement):
@@ -27,7 +38,9 @@ def test_schemas_import_no_simulation():
     assert find_heavy(f"import {', '.join(names)}") == []
 
 
-@pytest.mark.parametrize("names", ["cli", "study.db, drakerock.study.status, drakerock.study.display", "identity"])
+@pytest.mark.parametrize(
+    "names", ["cli", "study.db, drakerock.study.status, drakerock.study.display", "identity"]
+)
 def test_looking_at_a_study_imports_no_simulation(names):
     assert find_heavy(f"import drakerock.{names}") == []
 

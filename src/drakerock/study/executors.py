@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from drakerock.errors import InputError, RunStopped
+from drakerock.errors import DrakerockError, InputError, RunStopped
 from drakerock.study.schema import ExecutorConfig, SlurmConfig
 from drakerock.study.work import Task, TaskResult, run_task
 from drakerock.study.worker_setup import silence_closing
@@ -32,7 +32,7 @@ DASK = {
 }
 
 
-class WorkerLost(Exception):
+class WorkerLost(DrakerockError):
     """The worker of a task died: killed, out of memory, its machine gone."""
 
 

@@ -290,16 +290,6 @@ def load_study(path: str | Path, overrides: Sequence[str] = ()) -> StudyConfig:
         raise InputError(f"{path}: {where + ': ' if where else ''}{message}") from None
 
 
-def make_json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of a study file, for editors."""
-    schema = StudyConfig.model_json_schema()
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **schema,
-        "title": "drakerock study",
-    }
-
-
 class _StudyFile(StudyConfig):
     """A study as it stands in its file: checks that need the whole scenario come after it is whole."""
 

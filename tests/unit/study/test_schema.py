@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import yaml
 
+from drakerock.config import make_json_schema
 from drakerock.errors import InputError
 from drakerock.study.objectives import get_objective
-from drakerock.study.schema import load_study, make_json_schema
+from drakerock.study.schema import StudyConfig, load_study
 
 
 @pytest.fixture
@@ -134,7 +135,7 @@ def test_errors_name_file_key_and_what_is_allowed(write, data, parts):
 
 
 def test_json_schema_describes_the_keys():
-    schema = json.loads(json.dumps(make_json_schema()))
+    schema = json.loads(json.dumps(make_json_schema(StudyConfig, "study")))
     assert schema["additionalProperties"] is False
     assert {"variables", "objectives", "loadings", "executor", "storage"} <= set(schema["properties"])
     assert schema["$defs"]["StrategyConfig"]["properties"]["alpha"]["maximum"] == 2
