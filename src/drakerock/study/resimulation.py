@@ -17,7 +17,7 @@ from drakerock.exploration.problem import Array
 from drakerock.files import make_folder
 from drakerock.identity import get_versions
 from drakerock.study.db import Store, calc_inputs_hash, read_outcome
-from drakerock.study.executors import Executor, WorkerLost, make_executor
+from drakerock.study.executors import Executor, Losses, WorkerLost, make_executor
 from drakerock.study.objectives import get_objective
 from drakerock.study.runner import RUN_SEQUENCE, catch_signals
 from drakerock.study.tables import read_loadings
@@ -90,7 +90,8 @@ class Resimulation:
                     self._study.executor, lambda: None, self._folder, self._workers, self._scheduler
                 )
                 self._say(f"running on {executor.name}, {executor.n_workers} workers")
-                self._loop(executor, deque(_Waiting(task) for task in tasks))
+                limit = self._study.failures.max_worker_deaths
+                self._loop(executor, deque(_Waiting(task, Losses(limit)) for task in tasks))
         finally:
             if executor:
                 executor.close()
@@ -155,11 +156,11 @@ class Resimulation:
                 item = running.pop(task.folder)
                 if isinstance(result, WorkerLost):
                     self._say(str(result))
-                    item.deaths += 1
-                    if item.deaths < self._study.failures.max_worker_deaths:
+                    failure = item.losses.add(result)
+                    if failure is None:
                         waiting.appendleft(item)
                         continue
-                    result = TaskResult("failed", f"{result}, {item.deaths} times on end")
+                    result = failure
                 if result.status == "stopped":
                     continue
                 ended += 1
@@ -182,4 +183,4 @@ class Resimulation:
 @dataclass
 class _Waiting:
     task: Task
-    deaths: int = 0
+    losses: Losses

@@ -350,6 +350,7 @@ def test_slurm_job_script(tmp_path):
         directives=("--constraint=avx2",), prologue=("module load python",),
     )  # fmt: skip
     with make_slurm_cluster(config, tmp_path) as cluster:
+        assert cluster.scheduler.allowed_failures == 0  # the runner tries again, and counts
         script = cluster.job_script()
     for line in (
         "#SBATCH -p compute", "#SBATCH -A mine", "#SBATCH -n 1", "#SBATCH --cpus-per-task=1", "#SBATCH -t 12:00:00",
