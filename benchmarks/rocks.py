@@ -320,7 +320,7 @@ def bench_scaling(pile: PileState) -> None:
     total = pile
     for k in range(1, n_blocks + 1):
         total = total.join(replace(block, p_WRs=block.p_WRs + [k * width, 0.0, 0.0]))
-    site = SITE.model_copy(update={"void_depth": SITE.void_depth + n_blocks * width})
+    site = SITE.replace(void_depth=SITE.void_depth + n_blocks * width)
     bench_resting(total, site)
     few, many = bench_idle(pile, SITE), bench_idle(total, site)
     print(

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drakerock.config import calc_config_hash
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.files import write_text
+from drakerock.identity import calc_config_hash
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.randomness import make_generator
 

@@ -7,6 +7,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -267,11 +268,12 @@ def study_status(folder: StudyFolder, json_: JsonOption = False) -> None:
 
     Example: drakerock study status out/smoke
     """
+    from drakerock.study.db import Store
     from drakerock.study.display import make_status_table
-    from drakerock.study.store import Store
+    from drakerock.study.status import read_status
 
     with Store.open(folder) as store:
-        status = store.read_status()
+        status = read_status(store)
     if json_:
         print(json.dumps(status))
     else:
@@ -287,7 +289,7 @@ def study_export(
 
     Example: drakerock study export out/smoke --format parquet
     """
-    from drakerock.study.store import export_tables
+    from drakerock.study.tables import export_tables
 
     _print_paths(export_tables(folder, [format_]))
 
@@ -298,10 +300,11 @@ def study_verify(folder: StudyFolder, json_: JsonOption = False) -> None:
 
     Example: drakerock study verify out/smoke
     """
-    from drakerock.study.store import Store
+    from drakerock.study.db import Store
+    from drakerock.study.verify import verify_store
 
     with Store.open(folder) as store:
-        faults = store.verify()
+        faults = verify_store(store)
     if json_:
         print(json.dumps([vars(fault) for fault in faults]))
     else:
@@ -379,15 +382,27 @@ def strategy(
     print(json.dumps(chosen.to_dict(), indent=2) if json_ else chosen.to_text())
 
 
-@study_app.command("schema")
-def study_schema() -> None:
-    """Print the JSON Schema of study files, for editors.
+class FileKind(StrEnum):
+    """Kinds of files that a schema describes."""
 
-    Example: drakerock study schema > study.schema.json
+    scenario = "scenario"
+    study = "study"
+
+
+@app.command()
+def schema(kind: Annotated[FileKind, typer.Argument(help="Which files.")]) -> None:
+    """Print the JSON Schema of scenario or study files, for editors.
+
+    Example: drakerock schema scenario > scenario.schema.json
+
+    Example: drakerock schema study > study.schema.json
     """
-    from drakerock.study.schema import make_json_schema
+    from drakerock.config import make_json_schema
+    from drakerock.loading.scenario import Scenario
+    from drakerock.study.schema import StudyConfig
 
-    print(json.dumps(make_json_schema(), indent=2))
+    described = Scenario if kind == FileKind.scenario else StudyConfig
+    print(json.dumps(make_json_schema(described, f"drakerock {kind}"), indent=2))
 
 
 def _load(path: Path | None, seed: int | None, overrides: list[str] | None) -> Any:

@@ -28,7 +28,7 @@ def result(small_scenario, pile):
 
 def use_engine(scenario, engine):
     """Return the scenario with that rock engine."""
-    return scenario.model_copy(update={"dynamics": scenario.dynamics.model_copy(update={"rocks": engine})})
+    return scenario.replace(**{"dynamics.rocks": engine})
 
 
 def test_modes_run_in_order_and_the_load_is_weighed(result):
@@ -55,9 +55,7 @@ def test_bucket_forces_lift_the_load(result):
 
 def test_load_is_counted_when_s4_is_passed(small_scenario, pile, result):
     """The simulation stops in the step in which the controller passes s4, not at the next frame."""
-    config = small_scenario.model_copy(
-        update={"recording": small_scenario.recording.model_copy(update={"frame_rate": 2.0})}
-    )
+    config = small_scenario.replace(**{"recording.frame_rate": 2.0})
     coarse = run_cycle(config, pile).outcome
     assert coarse.bucket_mass_kg == result.outcome.bucket_mass_kg
     assert coarse.waypoint_times_s == result.outcome.waypoint_times_s
@@ -106,10 +104,8 @@ def test_recording_round_trip(result, tmp_path):
 
 def with_loading(scenario, **parts):
     """The scenario with some keys of its loading's parts changed."""
-    loading = scenario.loading.model_copy(
-        update={name: getattr(scenario.loading, name).model_copy(update=keys) for name, keys in parts.items()}
-    )
-    return use_engine(scenario.model_copy(update={"loading": loading}), "nonsmooth")
+    changes = {f"loading.{name}.{key}": value for name, keys in parts.items() for key, value in keys.items()}
+    return use_engine(scenario.replace(**changes), "nonsmooth")
 
 
 def test_reaching_s4_is_a_reason(result):
@@ -122,10 +118,7 @@ def test_time_outs_are_events_and_the_last_one_a_reason(small_scenario, pile):
     hurried = with_loading(
         small_scenario, control={"timeout": 0.3, "approach_time": 1.0}, performance={"settle_time": 0.5}
     )
-    weak = hurried.machine.model_copy(
-        update={"wheel": hurried.machine.wheel.model_copy(update={"effort": 10.0})}
-    )
-    outcome = run_cycle(hurried.model_copy(update={"machine": weak}), pile).outcome
+    outcome = run_cycle(hurried.replace(**{"machine.wheel.effort": 10.0}), pile).outcome
     assert outcome.reason == "s4 timed out"
     assert outcome.status == "done"
     times = {item["waypoint"]: item["time_s"] for item in outcome.events if item["event"] == "timeout"}
@@ -138,9 +131,8 @@ def test_time_outs_are_events_and_the_last_one_a_reason(small_scenario, pile):
 
 
 def test_wheels_without_grip_slip_as_an_event(small_scenario, pile):
-    site = small_scenario.site.model_copy(update={"friction": 0.02})
     scenario = with_loading(small_scenario, control={"timeout": 0.3, "approach_time": 1.0})
-    outcome = run_cycle(scenario.model_copy(update={"site": site}), pile).outcome
+    outcome = run_cycle(scenario.replace(**{"site.friction": 0.02}), pile).outcome
     slips = [item for item in outcome.events if item["event"] == "slip"]
     assert slips
     assert slips[0]["time_s"] < 0.5
@@ -159,7 +151,7 @@ def test_drift_too_narrow_has_no_candidate_slice(small_scenario, pile):
 def test_scanner_sees_enough_to_dig(small_scenario, pile):
     scenario = with_loading(small_scenario, sensing={"kind": "scanner"})
     fields = []
-    for config in (scenario, scenario, with_loading(small_scenario), scenario.model_copy(update={"seed": 6})):
+    for config in (scenario, scenario, with_loading(small_scenario), scenario.replace(seed=6)):
         station = make_station(config, pile)
         root = station.diagram.CreateDefaultContext()
         context = station.plant.GetMyMutableContextFromRoot(root)

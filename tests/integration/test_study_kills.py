@@ -16,7 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from drakerock.study.store import Store
+from drakerock.study.db import Store
+from drakerock.study.status import read_status
+from drakerock.study.verify import verify_store
 
 TESTS = Path(__file__).resolve().parents[1]
 STUDY = """
@@ -89,8 +91,8 @@ class Place:
         for name in ("responses.csv", "responses.parquet"):
             assert (self.out / name).read_bytes() == (reference / name).read_bytes()
         with Store.open(self.out) as store:
-            status = store.read_status()
-            assert store.verify() == []
+            status = read_status(store)
+            assert verify_store(store) == []
         assert status["complete"]
         assert status["cycles"] == {"total": N_CYCLES, "recorded": N_CYCLES, "failed": 0}
         assert status["failures"] == []
@@ -264,7 +266,7 @@ def test_ctrl_c_once_lets_the_running_cycles_finish(place, reference):
     assert "finishing the running cycles" in err
     assert place.count("start") == place.count("finish")
     with Store.open(place.out) as store:
-        status = store.read_status()
+        status = read_status(store)
     assert not status["running"]
     assert status["last_run"]["ending"] == "interrupted"
     assert status["cycles"]["recorded"] == place.count("finish").total() < N_CYCLES
@@ -313,8 +315,8 @@ def test_a_point_that_kills_its_worker_is_marked(place, mode, setting):
         STUDY_WORK_MODE=mode,
     )  # fmt: skip
     with Store.open(place.out) as store:
-        status, points = store.read_status(), store.list_points()
-        assert store.verify() == []
+        status, points = read_status(store), store.list_points()
+        assert verify_store(store) == []
     bad = {p.name for p in points if p.x[0] > 1.5}
     assert bad
     assert {item["point"] for item in status["points_failed"]} == bad

@@ -37,6 +37,8 @@ class MachineData(Config):
 class MachineConfig(Config):
     """Which machine, and what differs from its SDFormat file."""
 
+    file_fields = ("model",)
+
     model: str = Field(
         default="package://drakerock/lhd/lhd.sdf",
         description="the SDFormat file: a path, or package://drakerock/...",

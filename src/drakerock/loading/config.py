@@ -55,6 +55,8 @@ class SensingConfig(Config):
 class PlanningConfig(Config):
     """The dig plan's limits and speeds."""
 
+    file_fields = ("source",)
+
     source: Annotated[str | None, Field(description="a stored plan.json to execute instead of planning")] = (
         None
     )
@@ -118,6 +120,8 @@ class PerformanceConfig(Config):
 
 class PartConfig(Config):
     """A part of one's own in place of ours."""
+
+    file_fields = ("system",)
 
     system: Annotated[
         str | None,

@@ -14,8 +14,9 @@ from pydrake.systems.framework import Context, EventStatus
 
 from drakerock.errors import SimulationFailure
 from drakerock.files import make_folder, write_text
+from drakerock.loading.evaluation import make_outcome
 from drakerock.loading.field import HeightField
-from drakerock.loading.outcome import CycleOutcome, make_outcome
+from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.performance import Weighing, find_bucket_load, find_debris, find_lost
 from drakerock.loading.plan import DigPlan, NoPlan
 from drakerock.loading.plan_file import save_plan

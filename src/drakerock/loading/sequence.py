@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drakerock.config import calc_config_hash
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.files import make_folder
+from drakerock.identity import calc_config_hash, get_versions
 from drakerock.loading.cycle import CycleResult, run_cycle, save_cycle
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario, make_recipe
@@ -85,7 +85,16 @@ def _read_loading(place: Path, identity: str) -> tuple[CycleOutcome, PileState] 
         raise InputError(
             f"{path}: of another scenario ({outcome.scenario_hash}, not {identity}); take another folder"
         )
+    if outcome.versions != get_versions():
+        raise InputError(
+            f"{path}: made by other versions ({_show(outcome.versions)}, not {_show(get_versions())}); take another "
+            "folder"
+        )
     return outcome, load_pile(place / NEXT_PILE)
+
+
+def _show(versions: dict[str, str]) -> str:
+    return " ".join(f"{name} {number}" for name, number in versions.items())
 
 
 def _run_loading(

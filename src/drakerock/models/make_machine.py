@@ -14,14 +14,16 @@ from typing import Any
 
 import numpy as np
 import trimesh
-import yaml
+
+from drakerock.files import read_text
+from drakerock.yaml_reader import YamlDocument
 
 Mesh = trimesh.Trimesh
 
 
 def write_machine(design_file: Path) -> None:
     """Write <name>.sdf and the OBJ meshes into the folder of `design_file`."""
-    writer = Writer(yaml.safe_load(design_file.read_text()), design_file.parent)
+    writer = Writer(YamlDocument(read_text(design_file), str(design_file)).data, design_file.parent)
     writer.write()
 
 

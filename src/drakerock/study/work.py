@@ -5,18 +5,21 @@ from __future__ import annotations
 import errno
 import fcntl
 import importlib
+import os
+import socket
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
 
 from drakerock.errors import InputError
+from drakerock.identity import get_versions
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario
-from drakerock.study.store import get_versions, read_outcome
+from drakerock.study.db import read_outcome
 
 _DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
@@ -149,10 +152,30 @@ def _count_good(task: Task) -> tuple[int, str]:
     return n_good, failure
 
 
+def mark_waiting(task: Task) -> None:
+    """Note that a task has not begun; `run_task` notes that it has."""
+    with suppress(OSError):  # trouble with the disk is for the worker to tell
+        _find_lock(task).parent.mkdir(parents=True, exist_ok=True)
+        _find_lock(task).write_text("")
+
+
+def has_begun(task: Task) -> bool:
+    """Return whether a task has begun since `mark_waiting`."""
+    try:
+        return bool(_find_lock(task).read_text())
+    except OSError:
+        return True
+
+
+def _find_lock(task: Task) -> Path:
+    """Return the file that a worker holds while it runs the task, and that says which worker it was."""
+    return task.folder.with_suffix(".lock")
+
+
 @contextmanager
 def _hold(task: Task) -> Iterator[None]:
     """Hold the sequence's folder: a worker that has lost its runner may still be busy in it."""
-    with open(task.folder.with_suffix(".lock"), "a") as lock:
+    with open(_find_lock(task), "a") as lock:
         while True:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -161,4 +184,6 @@ def _hold(task: Task) -> Iterator[None]:
                 if task.stop_file.exists():
                     raise _Stop from None
                 time.sleep(0.2)
+        lock.write(f"{socket.gethostname()} {os.getpid()}\n")
+        lock.flush()
         yield

@@ -91,7 +91,7 @@ QUIET_SITE = SiteConfig(drift_width=3.9)
 
 
 def scan(heap, shapes, seed=0, **changes):
-    config = SCANNER.model_copy(update=changes)
+    config = SCANNER.replace(**changes)
     return calc_scan(heap, shapes, config, X_WF, np.random.default_rng(seed))
 
 
@@ -119,7 +119,7 @@ def calc_outside(equations, point):
 
 
 def test_rays_fill_the_field_of_view():
-    rays = make_ray_directions(SCANNER.model_copy(update={"resolution_deg": 1.0}))
+    rays = make_ray_directions(SCANNER.replace(resolution_deg=1.0))
     assert len(rays) == 121 * 61
     assert np.allclose(np.linalg.norm(rays, axis=1), 1.0)
     assert np.rad2deg(np.arcsin(rays[:, 2])).min() == pytest.approx(-30.0)

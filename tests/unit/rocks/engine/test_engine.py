@@ -531,11 +531,11 @@ def test_a_step_that_does_not_converge_is_redone_then_fails(fails):
     residuals = []
     for iterations, momentum in ((4, config.momentum), (16, 0.0)):
         update = {"iterations": iterations, "momentum": momentum}
-        engine = make_engine(pile, shapes, config=config.model_copy(update=update))
+        engine = make_engine(pile, shapes, config=config.replace(**update))
         residuals.append(engine.advance(engine.make_arrays(pile))[1].residual)
     assert residuals[0] > 2 * residuals[1] > 0
     bound = 0.9 * residuals[1] if fails else 1.1 * residuals[1]
-    engine = make_engine(pile, shapes, config=config.model_copy(update={"max_residual": bound}))
+    engine = make_engine(pile, shapes, config=config.replace(max_residual=bound))
     if fails:
         with pytest.raises(SimulationFailure, match=r"did not converge: residual .* after 16 iterations"):
             engine.advance(engine.make_arrays(pile))
