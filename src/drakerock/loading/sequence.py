@@ -12,6 +12,7 @@ from drakerock.errors import InputError, SimulationFailure
 from drakerock.files import make_folder
 from drakerock.loading.cycle import CycleOutcome, CycleResult, run_cycle, save_cycle
 from drakerock.loading.scenario import Scenario, make_recipe
+from drakerock.memory import free_diagrams
 from drakerock.randomness import make_generator
 from drakerock.rocks.making.settling import fetch_pile, refill
 from drakerock.rocks.shapes import load_rock_shapes
@@ -95,6 +96,7 @@ def _run_loading(
             progress(number, stage, time)
 
     result = run_cycle(scenario, pile, lambda mode, time: tell(mode.lower(), time))
+    free_diagrams()
     tell("refill", result.outcome.sim_time_s)
     following = make_next_pile(scenario, result, number)
     make_folder(place)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import gc
 import importlib
 import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -102,7 +104,9 @@ def run_task(task: Task, tick: Callable[[], None] | None = None) -> TaskResult:
     try:
         task.folder.parent.mkdir(parents=True, exist_ok=True)
         with _hold(task):
-            find_work(task.work)(task.scenario, task.n_loadings, task.folder, progress=progress)
+            work = find_work(task.work)
+            _freeze_imports()
+            work(task.scenario, task.n_loadings, task.folder, progress=progress)
         n_good, failure = _count_good(task)
     except _Stop:
         return TaskResult("stopped")
@@ -123,6 +127,15 @@ def find_work(name: str) -> Work:
     """Return the function of a ``module:name``."""
     module, _, function = name.partition(":")
     return getattr(importlib.import_module(module), function)
+
+
+@cache
+def _freeze_imports() -> None:
+    """Spare the garbage collector, which is asked to free each loading's Diagram, what was imported.
+
+    Of a small loading's 25 CPU seconds it takes 0.1 instead of 0.45.
+    """
+    gc.freeze()
 
 
 def is_disk_trouble(error: BaseException | None) -> bool:

@@ -27,6 +27,7 @@ from pydrake.systems.framework import Context, LeafSystem, ValueProducer
 
 from drakerock.lhd.geometry import collision_pieces, get_material
 from drakerock.lhd.model import Machine
+from drakerock.memory import weak
 from drakerock.rocks.engine.engine import MachinePiece, MachineStep, make_machineless_step
 from drakerock.rocks.engine.machine_step import (
     JOINT_WIDTH,
@@ -105,10 +106,11 @@ class MachineView(LeafSystem):
         self._plant = plant
         self._layout = layout
         self._stiction_tolerance = stiction_tolerance
-        self._bodies = [plant.GetBodyByName(name, machine.instance) for name in layout.bodies]
-        self._body_number = {int(body.index()): k for k, body in enumerate(self._bodies)}
+        # Indices: a body or frame of the plant that a system keeps would keep the Diagram alive (`drakerock.memory`).
+        self._bodies = [plant.GetBodyByName(name, machine.instance).index() for name in layout.bodies]
+        self._body_number = {int(body): k for k, body in enumerate(self._bodies)}
         self._loop_points = [
-            (plant.GetFrameByName(body, machine.instance), np.array(p))
+            (plant.GetFrameByName(body, machine.instance).index(), np.array(p))
             for loop in machine.loops
             for body, p in ((loop.body_A, loop.p_AP), (loop.body_B, loop.p_BQ))
         ]
@@ -122,19 +124,20 @@ class MachineView(LeafSystem):
         # The plant's kinematics are evaluated in a context of its own, wholly overwritten each time.
         self._scratch = self.DeclareCacheEntry(
             "scratch plant context",
-            ValueProducer(
-                allocate=lambda: Value[object](plant.CreateDefaultContext()), calc=lambda _, __: None
-            ),
+            ValueProducer(allocate=weak(self._make_scratch), calc=lambda _, __: None),
             {self.nothing_ticket()},
-        )
+        ).cache_index()
         self.DeclareAbstractOutputPort(
-            "machine_step", lambda: Value[object](make_machineless_step()), self._calc_step
+            "machine_step", lambda: Value[object](make_machineless_step()), weak(self._calc_step)
         )
+
+    def _make_scratch(self) -> Value:
+        return Value[object](self._plant.CreateDefaultContext())
 
     def _calc_step(self, context: Context, output: Value) -> None:
         plant, layout = self._plant, self._layout
         h = plant.time_step()
-        scratch = self._scratch.Eval(context)
+        scratch = self.get_cache_entry(self._scratch).Eval(context)
         plant.SetPositionsAndVelocities(scratch, self._state.Eval(context))
         v = plant.GetVelocities(scratch)
         forces = MultibodyForces(plant)
@@ -150,15 +153,16 @@ class MachineView(LeafSystem):
         )
 
         world = plant.world_frame()
+        bodies = [plant.get_body(index) for index in self._bodies]
         jacobian = np.array(
             [
                 plant.CalcJacobianSpatialVelocity(
                     scratch, JacobianWrtVariable.kV, body.body_frame(), np.zeros(3), world, world
                 )
-                for body in self._bodies
+                for body in bodies
             ]
         )
-        X_WBs = np.array([plant.EvalBodyPoseInWorld(scratch, body).GetAsMatrix4() for body in self._bodies])
+        X_WBs = np.array([plant.EvalBodyPoseInWorld(scratch, body).GetAsMatrix4() for body in bodies])
         positions = plant.GetPositions(scratch)
         joints = self._find_motor_laws(self._desired.Eval(context), positions, h)
         joints += self._find_stop_laws(positions, h)
@@ -183,7 +187,7 @@ class MachineView(LeafSystem):
         points = np.array(
             [
                 plant.CalcJacobianTranslationalVelocity(
-                    scratch, JacobianWrtVariable.kV, frame, p, world, world
+                    scratch, JacobianWrtVariable.kV, plant.get_frame(frame), p, world, world
                 )
                 for frame, p in self._loop_points
             ]

@@ -121,11 +121,12 @@ class PlantRocks(LeafSystem):
         self._v = (
             np.array([body.floating_velocities_start_in_v() for body in bodies], int) + plant.num_positions()
         )
-        self._rock_geometries = frozenset(geometries)
-        self._bucket = plant.GetBodyByName("bucket") if plant.HasBodyNamed("bucket") else None
-        self._bucket_geometries = frozenset(
-            plant.GetCollisionGeometriesForBody(self._bucket) if self._bucket else ()
-        )
+        self._rock_geometries = frozenset(geometry.get_value() for geometry in geometries)
+        bucket = plant.GetBodyByName("bucket") if plant.HasBodyNamed("bucket") else None
+        # Numbers: a body, or a geometry's id from the plant, would keep the Diagram alive (`drakerock.memory`).
+        self._bucket = None if bucket is None else int(bucket.index())
+        bucket_geometries = plant.GetCollisionGeometriesForBody(bucket) if bucket else []
+        self._bucket_geometries = frozenset(geometry.get_value() for geometry in bucket_geometries)
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         self._contacts = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         self._machine_poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
@@ -191,7 +192,7 @@ class PlantRocks(LeafSystem):
         total = np.zeros(6)
         if self._bucket is not None:
             results = self._contacts.Eval(context)
-            p_WB = self._machine_poses.Eval(context)[int(self._bucket.index())].translation()
+            p_WB = self._machine_poses.Eval(context)[self._bucket].translation()
             for k in range(results.num_point_pair_contacts()):
                 info = results.point_pair_contact_info(k)
                 pair = info.point_pair()
@@ -214,9 +215,10 @@ class PlantRocks(LeafSystem):
 
     def _find_side(self, first: GeometryId, second: GeometryId) -> float:
         """Return 1 if `first` is the bucket and `second` a rock, -1 the other way round, else 0."""
-        if first in self._bucket_geometries and second in self._rock_geometries:
+        one, other = first.get_value(), second.get_value()
+        if one in self._bucket_geometries and other in self._rock_geometries:
             return 1.0
-        if second in self._bucket_geometries and first in self._rock_geometries:
+        if other in self._bucket_geometries and one in self._rock_geometries:
             return -1.0
         return 0.0
 

@@ -25,6 +25,7 @@ from pydrake.systems.framework import (
 )
 
 from drakerock.lhd.model import Machine
+from drakerock.memory import weak
 from drakerock.rocks.config import RocksConfig
 from drakerock.rocks.drake.coupling import MachineLayout, MachineView, make_machine_layout
 from drakerock.rocks.drake.interface import ROCK_SUMMARY
@@ -103,10 +104,10 @@ class NonsmoothRocks(LeafSystem):
         self._machine = self.DeclareAbstractInputPort("machine_step", Value[object](make_machineless_step()))
         step = self.DeclareCacheEntry(
             "step",
-            ValueProducer(allocate=self._make_step, calc=self._calc_step),
+            ValueProducer(allocate=weak(self._make_step), calc=weak(self._calc_step)),
             {self.xd_ticket(), self._machine.ticket()},
         )
-        self._step = step
+        self._step = step.cache_index()
         state_only = {self.xd_ticket()}
         self.DeclareVectorOutputPort("rock_poses", 7 * n, self._calc_poses, state_only)
         self.DeclareVectorOutputPort("rock_velocities", 6 * n, self._calc_velocities, state_only)
@@ -116,7 +117,7 @@ class NonsmoothRocks(LeafSystem):
         self.DeclareAbstractOutputPort(
             "spatial_forces",
             lambda: Value[list[ExternallyAppliedSpatialForce]]([]),
-            self._calc_spatial_forces,
+            weak(self._calc_spatial_forces),
             {step.ticket()},
         )
         self.DeclarePeriodicDiscreteUpdateEvent(engine.time_step, 0.0, self._update)
@@ -179,7 +180,7 @@ class NonsmoothRocks(LeafSystem):
         value.set_value(_Step(*self._engine.step(self._get_arrays(context), machine, room), room))
 
     def _solve(self, context: Context) -> tuple[RockArrays, StepReport]:
-        step: _Step = self._step.Eval(context)
+        step: _Step = self.get_cache_entry(self._step).Eval(context)
         assert step.report is not None
         return step.arrays, step.report
 
