@@ -16,6 +16,7 @@ from scipy.stats import binned_statistic_2d
 from drakerock.errors import InputError
 from drakerock.loading.config import ScannerConfig, SensingConfig
 from drakerock.loading.field import HeightField
+from drakerock.memory import weak
 from drakerock.randomness import make_generator
 from drakerock.rocks.config import SiteConfig
 from drakerock.rocks.geometry import cast_rays, make_pile_mesh
@@ -190,7 +191,7 @@ class PileSensor(LeafSystem):
         self.DeclareAbstractOutputPort(
             "height_field",
             lambda: AbstractValue.Make(empty),
-            self._calc_height_field,
+            weak(self._calc_height_field),
             prerequisites_of_calc=inputs,
         )
 

@@ -13,6 +13,7 @@ from drakerock.identity import calc_config_hash, get_versions
 from drakerock.loading.cycle import CycleResult, run_cycle, save_cycle
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario, make_recipe
+from drakerock.memory import free_diagrams
 from drakerock.randomness import make_generator
 from drakerock.rocks.making.settling import fetch_pile, refill
 from drakerock.rocks.shapes import load_rock_shapes
@@ -105,6 +106,7 @@ def _run_loading(
             progress(number, stage, time)
 
     result = run_cycle(scenario, pile, lambda mode, time: tell(mode.lower(), time))
+    free_diagrams()
     tell("refill", result.outcome.sim_time_s)
     following = make_next_pile(scenario, result, number)
     make_folder(place)

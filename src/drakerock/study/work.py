@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import gc
 import importlib
 import os
 import socket
@@ -12,6 +13,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -105,7 +107,9 @@ def run_task(task: Task, tick: Callable[[], None] | None = None) -> TaskResult:
     try:
         task.folder.parent.mkdir(parents=True, exist_ok=True)
         with _hold(task):
-            find_work(task.work)(task.scenario, task.n_loadings, task.folder, progress=progress)
+            work = find_work(task.work)
+            _freeze_imports()
+            work(task.scenario, task.n_loadings, task.folder, progress=progress)
         n_good, failure = _count_good(task)
     except _Stop:
         return TaskResult("stopped")
@@ -126,6 +130,15 @@ def find_work(name: str) -> Work:
     """Return the function of a ``module:name``."""
     module, _, function = name.partition(":")
     return getattr(importlib.import_module(module), function)
+
+
+@cache
+def _freeze_imports() -> None:
+    """Spare the garbage collector, which is asked to free each loading's Diagram, what was imported.
+
+    Of a small loading's 25 CPU seconds it takes 0.1 instead of 0.45.
+    """
+    gc.freeze()
 
 
 def is_disk_trouble(error: BaseException | None) -> bool:

@@ -60,12 +60,10 @@ class ConvexPiece:
     """A proximity geometry of a body as a convex solid.
 
     Attributes:
-        geometry: its id.
         vertices: (k, 3) in the body's frame [m].
         material: of its surface.
     """
 
-    geometry: GeometryId
     vertices: Array
     material: Material
 
@@ -76,17 +74,13 @@ class PlantGeometry:
 
     Attributes:
         surroundings: all that is welded to the world.
-        static_geometries: ids of its pieces, then of its half-spaces.
         bodies: the others with proximity geometry, in the plant's order.
         pieces: their convex pieces, numbered by their place in `bodies`.
-        piece_geometries: ids of these.
     """
 
     surroundings: surroundings.Surroundings
-    static_geometries: tuple[GeometryId, ...]
     bodies: tuple[BodyIndex, ...]
     pieces: tuple[MachinePiece, ...]
-    piece_geometries: tuple[GeometryId, ...]
 
     def calc_box(self, number: int) -> Array:
         """Return (2, 3): lower and upper corner of a body's pieces in its frame [m]; `number` in `bodies`."""
@@ -117,11 +111,10 @@ def read_plant_geometry(
     inspector = scene_graph.model_inspector()
     context = plant.CreateDefaultContext()
     static_bodies = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
-    half_spaces: list[tuple[GeometryId, surroundings.HalfSpace]] = []
-    static: list[tuple[GeometryId, surroundings.StaticPiece]] = []
+    half_spaces: list[surroundings.HalfSpace] = []
+    static: list[surroundings.StaticPiece] = []
     bodies: list[BodyIndex] = []
     pieces: list[MachinePiece] = []
-    piece_geometries: list[GeometryId] = []
     for index in map(BodyIndex, range(plant.num_bodies())):
         body = plant.get_body(index)
         geometries = [g for g in plant.GetCollisionGeometriesForBody(body) if g not in ignored]
@@ -130,9 +123,9 @@ def read_plant_geometry(
             for geometry in geometries:
                 found = _read_static(inspector, body, geometry, X_WB, lower, upper)
                 if isinstance(found, surroundings.HalfSpace):
-                    half_spaces.append((geometry, found))
+                    half_spaces.append(found)
                 else:
-                    static.append((geometry, found))
+                    static.append(found)
         elif geometries:
             _require_mass(plant, body)
             for piece in _read_pieces(inspector, body, geometries):
@@ -141,16 +134,11 @@ def read_plant_geometry(
                         len(bodies), piece.vertices, piece.material.friction, piece.material.stiffness
                     )
                 )
-                piece_geometries.append(piece.geometry)
             bodies.append(index)
     return PlantGeometry(
-        surroundings.Surroundings(
-            tuple(plane for _, plane in half_spaces), tuple(piece for _, piece in static), lower, upper
-        ),
-        tuple(geometry for geometry, _ in [*static, *half_spaces]),
+        surroundings.Surroundings(tuple(half_spaces), tuple(static), lower, upper),
         tuple(bodies),
         tuple(pieces),
-        tuple(piece_geometries),
     )
 
 
@@ -168,7 +156,7 @@ def _read_pieces(
     for geometry in geometries:
         vertices = _make_vertices(inspector, body, geometry)
         X_BG = inspector.GetPoseInFrame(geometry)
-        yield ConvexPiece(geometry, _transform(X_BG, vertices), read_material(inspector, geometry))
+        yield ConvexPiece(_transform(X_BG, vertices), read_material(inspector, geometry))
 
 
 def _read_static(

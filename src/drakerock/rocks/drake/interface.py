@@ -15,6 +15,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, OutputPort
 
+from drakerock.memory import weak
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.state import PileState, make_empty_pile
 
@@ -112,24 +113,26 @@ class RockSystem(LeafSystem):
         return self._shapes
 
     def _declare_outputs(self, report_ticket: object, state_ticket: object) -> None:
+        n_bodies = self._plant.num_bodies()
         self.DeclareAbstractOutputPort(
-            "pile", lambda: Value[object](make_empty_pile()), self._calc_pile, {state_ticket}
+            "pile", lambda: Value[object](make_empty_pile()), weak(self._calc_pile), {state_ticket}
         )
         self.DeclareAbstractOutputPort(
-            "poses", lambda: Value[list[RigidTransform]]([]), self._calc_poses, {state_ticket}
+            "poses", lambda: Value[list[RigidTransform]]([]), weak(self._calc_poses), {state_ticket}
         )
         self.DeclareVectorOutputPort("summary", len(ROCK_SUMMARY), self._calc_summary, {report_ticket})
         self.DeclareAbstractOutputPort(
             "body_spatial_forces",
-            lambda: Value([SpatialForce.Zero()] * self._plant.num_bodies()),
-            self._calc_body_forces,
+            lambda: Value([SpatialForce.Zero()] * n_bodies),
+            weak(self._calc_body_forces),
             {report_ticket},
         )
+        calc_body_force = weak(self._calc_body_force)
         for k, index in enumerate(self._bodies):
             self.DeclareVectorOutputPort(
                 _name_force_port(self._plant, index),
                 6,
-                lambda context, output, k=k: self._calc_body_force(context, output, k),
+                lambda context, output, k=k: calc_body_force(context, output, k),
                 {report_ticket},
             )
 

@@ -22,6 +22,7 @@ from pydrake.multibody.tree import BodyIndex, RotationalInertia, SpatialInertia
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus
 
 from drakerock.errors import InputError, SimulationFailure
+from drakerock.memory import weak
 from drakerock.rocks.config import RocksConfig
 from drakerock.rocks.drake.drift import make_convex
 from drakerock.rocks.drake.interface import ROCK_SUMMARY, RockContacts, RockSystem, make_empty_contacts
@@ -159,10 +160,11 @@ class PlantRocks(RockSystem):
         self._v = (
             np.array([body.floating_velocities_start_in_v() for body in free], int) + plant.num_positions()
         )
-        self._rock_of = {geometry: rock for rock, geometry in enumerate(bodies.geometries)}
+        # By the ids' values: ids from the plant would keep the Diagram alive (`drakerock.memory`).
+        self._rock_of = {geometry.get_value(): rock for rock, geometry in enumerate(bodies.geometries)}
         self._number = {int(index): k for k, index in enumerate(touching)}
         self._body_of = {
-            geometry: index
+            geometry.get_value(): int(index)
             for index in map(BodyIndex, range(plant.num_bodies()))
             for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(index))
         }
@@ -173,7 +175,7 @@ class PlantRocks(RockSystem):
         self._report = report
         self._declare_outputs(self.discrete_state_ticket(report), self._state.ticket())
         self.DeclareAbstractOutputPort(
-            "contacts", lambda: Value[object](make_empty_contacts()), self._calc_contacts
+            "contacts", lambda: Value[object](make_empty_contacts()), weak(self._calc_contacts)
         )
         self.DeclarePeriodicDiscreteUpdateEvent(plant.time_step(), 0.0, self._update)
         # Publish events come in the order of the systems: this one before those of the logs.
@@ -266,12 +268,12 @@ class PlantRocks(RockSystem):
         depth: float,
     ) -> None:
         """Add a contact with spatial force (6,) on the second, if a rock has part in it."""
-        rock, other = self._rock_of.get(first), self._rock_of.get(second)
+        rock, other = self._rock_of.get(first.get_value()), self._rock_of.get(second.get_value())
         if rock is None:
             first, second, rock, other, force = second, first, other, rock, -force
         if rock is None:
             return
-        body = -1 if other is not None else int(self._body_of[second])
+        body = -1 if other is not None else self._body_of[second.get_value()]
         if body >= 0 and body not in self._number:
             body = 0
         rows.append((rock, -1 if other is None else other, body, p_WC, force[3:], force[:3], depth))

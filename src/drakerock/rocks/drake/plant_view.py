@@ -22,11 +22,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
-from pydrake.geometry import QueryObject
+from pydrake.geometry import GeometryId, QueryObject
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, ModelInstanceIndex, MultibodyForces
 from pydrake.systems.framework import Context, InputPort, LeafSystem, ValueProducer
 
+from drakerock.memory import weak
 from drakerock.rocks.drake.geometry import Material, read_material
 from drakerock.rocks.engine.engine import MachineStep, make_machineless_step
 from drakerock.rocks.engine.machine_step import (
@@ -107,13 +108,14 @@ class PlantView(LeafSystem):
         self.set_name("plant_view")
         self._plant = plant
         self._stiction_tolerance = stiction_tolerance
-        self._bodies = [plant.get_body(index) for index in bodies]
+        # Indices: a body or frame that a system keeps would keep the Diagram alive (`drakerock.memory`).
+        self._bodies = list(bodies)
         self._number = {int(index): k for k, index in enumerate(bodies)}
         self._wake_boxes = [
             (self._number[int(box.body)], np.concatenate([box.lower, box.upper])) for box in wake_boxes
         ]
         self._loop_points = [
-            (plant.get_body(body).body_frame(), np.asarray(p, float))
+            (body, np.asarray(p, float))
             for loop in loops
             for body, p in ((loop.body_A, loop.p_AP), (loop.body_B, loop.p_BQ))
         ]
@@ -124,7 +126,7 @@ class PlantView(LeafSystem):
                 plant.num_constraints(),
                 len(loops),
             )
-        self._materials: dict[object, tuple[int | None, Material]] = {}
+        self._materials: dict[int, tuple[int | None, Material]] = {}
         self._motors = _find_motors(plant)
         self._stops = _find_stops(plant)
         self._damping = _find_damping(plant)
@@ -145,22 +147,23 @@ class PlantView(LeafSystem):
         # The plant's kinematics are evaluated in a context of its own, wholly overwritten each time.
         self._scratch = self.DeclareCacheEntry(
             "scratch plant context",
-            ValueProducer(
-                allocate=lambda: Value[object](plant.CreateDefaultContext()), calc=lambda _, __: None
-            ),
+            ValueProducer(allocate=weak(self._make_scratch), calc=lambda _, __: None),
             {self.nothing_ticket()},
-        )
+        ).cache_index()
         self.DeclareAbstractOutputPort(
-            "plant_step", lambda: Value[object](make_machineless_step()), self._calc_step
+            "plant_step", lambda: Value[object](make_machineless_step()), weak(self._calc_step)
         )
 
     def _declare(self, port: InputPort) -> InputPort:
         return self.DeclareVectorInputPort(port.get_name(), port.size())
 
+    def _make_scratch(self) -> Value:
+        return Value[object](self._plant.CreateDefaultContext())
+
     def _calc_step(self, context: Context, output: Value) -> None:
         plant = self._plant
         h = plant.time_step()
-        scratch = self._scratch.Eval(context)
+        scratch = self.get_cache_entry(self._scratch).Eval(context)
         plant.SetPositionsAndVelocities(scratch, self._state.Eval(context))
         v, positions = plant.GetVelocities(scratch), plant.GetPositions(scratch)
         generalised, joints = self._calc_own_forces(context, scratch, positions, h)
@@ -171,16 +174,17 @@ class PlantView(LeafSystem):
             self._calc_loop_rows(scratch, len(v)),
         )
         world = plant.world_frame()
+        bodies = [plant.get_body(index) for index in self._bodies]
         jacobian = np.array(
             [
                 plant.CalcJacobianSpatialVelocity(
                     scratch, JacobianWrtVariable.kV, body.body_frame(), np.zeros(3), world, world
                 )
-                for body in self._bodies
+                for body in bodies
             ]
         ).reshape(-1, 6, len(v))
         X_WBs = np.array(
-            [plant.EvalBodyPoseInWorld(scratch, body).GetAsMatrix4() for body in self._bodies]
+            [plant.EvalBodyPoseInWorld(scratch, body).GetAsMatrix4() for body in bodies]
         ).reshape(-1, 4, 4)
         contacts = self._find_own_contacts(self._query.Eval(context))
         arrays = make_machine_arrays(
@@ -253,9 +257,9 @@ class PlantView(LeafSystem):
         points = np.array(
             [
                 plant.CalcJacobianTranslationalVelocity(
-                    scratch, JacobianWrtVariable.kV, frame, p, world, world
+                    scratch, JacobianWrtVariable.kV, plant.get_body(body).body_frame(), p, world, world
                 )
-                for frame, p in self._loop_points
+                for body, p in self._loop_points
             ]
         ).reshape(-1, 2, 3, n_v)
         return np.asarray(points[:, 0] - points[:, 1]).reshape(-1, n_v)
@@ -295,17 +299,15 @@ class PlantView(LeafSystem):
             )
         return contacts
 
-    def _find_material(self, query: QueryObject, geometry: object) -> tuple[int | None, Material]:
+    def _find_material(self, query: QueryObject, geometry: GeometryId) -> tuple[int | None, Material]:
         """Return a geometry's body number (None: at rest) and its material."""
-        if geometry not in self._materials:
+        key = geometry.get_value()
+        if key not in self._materials:
             # Looked up once per geometry: it follows from the finalized plant alone.
             inspector = query.inspector()
             body = self._plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
-            self._materials[geometry] = (
-                self._number.get(int(body.index())),
-                read_material(inspector, geometry),
-            )
-        return self._materials[geometry]
+            self._materials[key] = self._number.get(int(body.index())), read_material(inspector, geometry)
+        return self._materials[key]
 
 
 @dataclass(frozen=True)

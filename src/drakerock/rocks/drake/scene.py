@@ -20,6 +20,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, ValueProducer
 from scipy.spatial.transform import Rotation
 
+from drakerock.memory import weak
 from drakerock.rocks.drake.drift import make_convex, make_looks
 from drakerock.rocks.drake.interface import RockSystem
 from drakerock.rocks.state import PileState, make_empty_pile
@@ -50,21 +51,20 @@ class RockPoses(LeafSystem):
         self._rocks = np.array(list(frames), np.int64)
         self._frames = list(frames.values())
         self._pile = self.DeclareAbstractInputPort("pile", Value[object](make_empty_pile()))
+        n = len(frames)
         # What the output holds, so that only what has moved is written anew.
         self._shown = self.DeclareCacheEntry(
             "shown",
-            ValueProducer(
-                allocate=lambda: Value[object](np.full((len(frames), 7), np.nan)), calc=lambda _, __: None
-            ),
+            ValueProducer(allocate=lambda: Value[object](np.full((n, 7), np.nan)), calc=lambda _, __: None),
             {self.nothing_ticket()},
-        )
+        ).cache_index()
         self.DeclareAbstractOutputPort(
-            "geometry_pose", lambda: Value(FramePoseVector()), self._calc, {self._pile.ticket()}
+            "geometry_pose", lambda: Value(FramePoseVector()), weak(self._calc), {self._pile.ticket()}
         )
 
     def _calc(self, context: Context, output: Value) -> None:
         pile: PileState = self._pile.Eval(context)
-        shown: NDArray[np.float64] = self._shown.Eval(context)
+        shown: NDArray[np.float64] = self.get_cache_entry(self._shown).Eval(context)
         poses = np.hstack([pile.q_WRs, pile.p_WRs])[self._rocks]
         vector = output.get_mutable_value()
         stale = (

@@ -22,6 +22,7 @@ from pydrake.systems.framework import (
 )
 
 from drakerock.errors import InputError
+from drakerock.memory import weak
 from drakerock.rocks.drake.geometry import PlantGeometry
 from drakerock.rocks.drake.interface import ROCK_SUMMARY, RockContacts, RockSystem, make_empty_contacts
 from drakerock.rocks.engine import contacts, reduction
@@ -90,7 +91,6 @@ class NonsmoothRocks(RockSystem):
         """
         super().__init__(plant, pile, shapes, geometry.bodies)
         self._engine = engine
-        self._geometry = geometry
         self._provenance = dict(pile.provenance)
         n = engine.n_rocks
         n_bodies = len(geometry.bodies)
@@ -106,20 +106,23 @@ class NonsmoothRocks(RockSystem):
         )
         step = self.DeclareCacheEntry(
             "step",
-            ValueProducer(allocate=self._make_step, calc=self._calc_step),
+            ValueProducer(allocate=weak(self._make_step), calc=weak(self._calc_step)),
             {self.xd_ticket(), self._plant_step.ticket()},
         )
-        self._step = step
+        self._step = step.cache_index()
         state = self.xd_ticket()
         self._declare_outputs(self.discrete_state_ticket(self._groups["report"]), state)
         self.DeclareVectorOutputPort("status", n, self._calc_status, {state})
         self.DeclareAbstractOutputPort(
-            "contacts", lambda: Value[object](make_empty_contacts()), self._calc_contacts, {step.ticket()}
+            "contacts",
+            lambda: Value[object](make_empty_contacts()),
+            weak(self._calc_contacts),
+            {step.ticket()},
         )
         self.DeclareAbstractOutputPort(
             "applied_spatial_force",
             lambda: Value[list[ExternallyAppliedSpatialForce]]([]),
-            self._calc_applied_force,
+            weak(self._calc_applied_force),
             {step.ticket(), self._others.ticket()},
         )
         self.DeclareInitializationPublishEvent(self._check_start)
@@ -197,7 +200,7 @@ class NonsmoothRocks(RockSystem):
         value.set_value(_Step(*self._engine.step(self._get_arrays(context), plant_step, room), room))
 
     def _solve(self, context: Context) -> tuple[RockArrays, StepReport]:
-        step: _Step = self._step.Eval(context)
+        step: _Step = self.get_cache_entry(self._step).Eval(context)
         assert step.report is not None
         return step.arrays, step.report
 
@@ -238,7 +241,7 @@ class NonsmoothRocks(RockSystem):
         table = self._engine.find_loaded_contacts(self._get_arrays(context), self._read_plant_step(context))
         n = self._engine.n_rocks
         first_piece = self._engine.first_piece
-        bodies = np.array([int(index) for index in self._geometry.bodies], np.int64)
+        bodies = np.array([int(index) for index in self._bodies], np.int64)
         on_rock, on_piece = table.second < n, table.second >= first_piece
         number = np.zeros(len(table.second), np.int64)
         if len(bodies):
