@@ -1,4 +1,4 @@
-"""The closed loops behind boom, bucket and articulation: reading, closing and measuring them.
+"""The closed loops behind boom, bucket and articulation: closing and measuring them.
 
 In a machine's reference pose (level on the floor, straight, the bucket level on the floor) every passive
 joint (cylinders, rods, cranks) is at 0 and the loops are closed; from there they are followed step by step.
@@ -6,17 +6,13 @@ joint (cylinders, rods, cranks) is at 0 and the loops are closed; from there the
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
-from dataclasses import dataclass
-from pathlib import Path
-
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable, Joint, ModelInstanceIndex
 from pydrake.systems.framework import Context
 
-from drakerock.errors import InputError
 from drakerock.lhd import names
+from drakerock.lhd.model_file import Loop
 
 Array = np.ndarray
 
@@ -24,35 +20,6 @@ Array = np.ndarray
 _TOLERANCE = 1e-6
 _MAX_ITERATIONS = 12
 _MAX_STEP = 0.15
-
-
-@dataclass(frozen=True)
-class Loop:
-    """A closed loop: point `p_AP` of `body_A` stays on `p_BQ` of `body_B` [m, in the bodies' frames]."""
-
-    body_A: str
-    p_AP: tuple[float, ...]
-    body_B: str
-    p_BQ: tuple[float, ...]
-
-
-def read_loops(file: str | Path) -> tuple[Loop, ...]:
-    """Return the loops that the SDFormat file closes by `drake:ball_constraint` (the plant doesn't tell)."""
-    prefix = "{drake.mit.edu}ball_constraint"
-
-    def read(element: ET.Element, key: str) -> str:
-        found = element.find(f"{prefix}_{key}")
-        if found is None or not found.text:
-            raise InputError(f"{file}: a drake:ball_constraint has no drake:ball_constraint_{key}")
-        return found.text.strip()
-
-    def numbers(text: str) -> tuple[float, ...]:
-        return tuple(float(value) for value in text.split())
-
-    return tuple(
-        Loop(read(e, "body_A"), numbers(read(e, "p_AP")), read(e, "body_B"), numbers(read(e, "p_BQ")))
-        for e in ET.parse(file).getroot().iter(prefix)
-    )
 
 
 def find_passive_joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Joint]:

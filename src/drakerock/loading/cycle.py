@@ -321,7 +321,8 @@ def save_cycle(result: CycleResult, folder: str | Path) -> list[Path]:
 def _place(station: Station, root: Any, x_tip: float, y: float) -> None:
     context = station.plant.GetMyMutableContextFromRoot(root)
     z_tip = station.scenario.loading.planning.floor_clearance
-    set_machine_pose(station.plant, context, station.machine, x_tip=x_tip, y=y, z_tip=z_tip)
+    kin = station.digger.kinematics
+    set_machine_pose(station.plant, context, station.machine, x_tip=x_tip, y=y, z_tip=z_tip, kin=kin)
 
 
 def _calc_floor_force(station: Station, plant_context: Any) -> float:
