@@ -35,7 +35,7 @@ from drakerock.lhd import names
 from drakerock.lhd.config import MachineConfig, MotorConfig
 from drakerock.lhd.outline import Outline
 from drakerock.resources import find_data
-from drakerock.rocks.drake.constraints import read_ball_constraints
+from drakerock.rocks.ball_constraints import read_ball_constraints
 
 Array = np.ndarray
 
@@ -443,7 +443,7 @@ class _Check:
 
     def _check_profile(self) -> None:
         """The bucket's inside has to be an outline that rock can lie in."""
-        points = []
+        points: list[Array] = []
         while self.plant.HasFrameNamed(f"{names.PROFILE}{len(points)}", self.instance):
             points.append(self._locate(f"{names.PROFILE}{len(points)}", "bucket"))
         corners = np.array(points)

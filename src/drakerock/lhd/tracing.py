@@ -59,7 +59,7 @@ def trace_range(plant: MultibodyPlant, machine: Machine, phi_l: float, phi_b: fl
     """Trace what `find_range` returns."""
     name = machine.config.model
     if not np.isfinite([phi_l, phi_b]).all():
-        raise InputError(f"{name}: the boom cannot lay the bucket level on the floor: hinges, tip and 'floor' don't fit")
+        raise InputError(f"{name}: the bucket cannot lie level on the floor: its boom is too short")
     return np.array(_Tracer(plant, machine).trace(phi_l, phi_b))
 
 
@@ -94,7 +94,8 @@ class _Tracer:
             self._linkage.reset(phi_l, phi_b)
             steps: Iterable[float] = np.arange(_GRID_STEP, _FARTHEST, _GRID_STEP)
             if all(
-                self._linkage.move(0.0, phi_l + sign * s, phi_b - sign * s) and self._linkage.calc_margin() > 0
+                self._linkage.move(0.0, phi_l + sign * s, phi_b - sign * s)
+                and self._linkage.calc_margin() > 0
                 for s in steps
             ):
                 raise self._miss_stop("boom")
@@ -160,7 +161,9 @@ def _describe(plant: MultibodyPlant, machine: Machine, phi_l: float, phi_b: floa
         ]
         limits = [joint.position_lower_limits().tolist(), joint.position_upper_limits().tolist()]
         axis = [
-            getattr(joint, get)().tolist() for get in ("revolute_axis", "translation_axis") if hasattr(joint, get)
+            getattr(joint, get)().tolist()
+            for get in ("revolute_axis", "translation_axis")
+            if hasattr(joint, get)
         ]
         joints.append([joint.name(), joint.type_name(), axis, frames, limits])
     loops = [[loop.body_A, loop.p_AP, loop.body_B, loop.p_BQ] for loop in machine.loops]

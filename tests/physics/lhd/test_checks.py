@@ -10,8 +10,10 @@ import pytest
 from rich.console import Console
 
 from drakerock.config import load_config
-from drakerock.lhd.checks.checks import make_check_data, make_check_table, run_machine_checks
-from drakerock.lhd.config import CheckConfig, MachineConfig, MotorConfig
+from drakerock.lhd.checks.bench import CheckConfig
+from drakerock.lhd.checks.checks import run_machine_checks
+from drakerock.lhd.checks.rows import make_check_data, make_check_table
+from drakerock.lhd.config import MachineConfig, MotorConfig
 
 SMALL = load_config(Path(__file__).with_name("lhd_small.yaml"), MachineConfig)
 
