@@ -64,8 +64,9 @@ class Linkage:
         self._plant.SetPositions(self._context, q)
 
     def move(self, articulation: float, phi_l: float, phi_b: float) -> bool:
-        """Move to these angles [rad] with the loops closed; False where they can't be (state undefined)."""
-        start = self._plant.GetPositions(self._context)[self._driven]
+        """Move to these angles [rad] with the loops closed; False where they can't be (nothing is moved then)."""
+        before = self._plant.GetPositions(self._context).copy()
+        start = before[self._driven]
         target = np.array([articulation, phi_l, phi_b])
         steps = max(1, int(np.ceil(np.abs(target - start).max() / _MAX_STEP)))
         for k in range(1, steps + 1):
@@ -73,6 +74,7 @@ class Linkage:
             q[self._driven] = start + (target - start) * k / steps
             self._plant.SetPositions(self._context, q)
             if not self._close():
+                self._plant.SetPositions(self._context, before)
                 return False
         return True
 

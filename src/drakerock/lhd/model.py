@@ -58,7 +58,7 @@ def add_machine(plant: MultibodyPlant, config: MachineConfig) -> Machine:
         InputError: no such file, or something in it that cannot be used (`check_machine_file`).
     """
     file = check_machine_file(config)
-    instance = parse_machine(plant, file.path, config.model)
+    instance, _ = parse_machine(plant, file.path, config.model)
     _warn_of(file.ignored)
 
     wheels = [_apply_motor(plant, instance, j, config.wheel, config) for j in names.WHEEL_JOINTS]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -78,20 +79,19 @@ def check_machine_file(config: MachineConfig) -> MachineFile:
     outline = Outline(path, config.model)
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01), builder)
-    with _hear_drake() as warnings:
-        instance = parse_machine(plant, path, config.model)
-    _refuse_bad_warnings(warnings)
-    try:
-        plant.Finalize()
-    except RuntimeError as error:
-        raise InputError(f"{config.model}: {_shorten(error)}") from None
+    instance, warnings = parse_machine(plant, path, config.model)
+    _refuse_bad_warnings(warnings, config.model)
     check = _Check(plant, scene_graph, instance, config, outline)
-    check.run()
-    return MachineFile(path, check.loops, (*outline.ignored, *warnings, *check.ignored))
+    with _refuse_failures(config.model, path):
+        plant.Finalize()
+        check.run()
+    # Drake tells some of what the outline finds.
+    ignored = dict.fromkeys([*outline.ignored, *warnings, *check.ignored])
+    return MachineFile(path, check.loops, tuple(ignored))
 
 
-def parse_machine(plant: MultibodyPlant, path: str, name: str) -> ModelInstanceIndex:
-    """Parse a machine's file into a plant before its Finalize.
+def parse_machine(plant: MultibodyPlant, path: str, name: str) -> tuple[ModelInstanceIndex, list[str]]:
+    """Parse a machine's file into a plant before its Finalize; return the model and what Drake warns of.
 
     Args:
         plant: the plant.
@@ -101,13 +101,11 @@ def parse_machine(plant: MultibodyPlant, path: str, name: str) -> ModelInstanceI
     Raises:
         InputError: Drake cannot read the file, or it holds other than one model.
     """
-    try:
+    with _refuse_failures(name, path), _hear_drake() as heard:
         found = _make_parser(plant).AddModels(path)
-    except RuntimeError as error:
-        raise InputError(f"{name}: {_shorten(error)}") from None
     if len(found) != 1:
         raise InputError(f"{name}: expected one <model>, found {len(found)}")
-    return found[0]
+    return found[0], [_rename(text, path, name).replace("warning: ", "") for text in heard]
 
 
 def _make_parser(plant: MultibodyPlant) -> Parser:
@@ -122,17 +120,29 @@ def _resolve(model: str) -> str:
         try:
             path = _make_parser(MultibodyPlant(0.01)).package_map().ResolveUrl(model)
         except RuntimeError as error:
-            raise InputError(f"machine.model: {model}: {_shorten(error)}") from None
+            raise InputError(f"machine.model: {model}: {error}") from None
     if not Path(path).is_file():
         raise InputError(f"machine.model: {model}: no such file")
     if Path(path).suffix != ".sdf":
         raise InputError(f"machine.model: {model}: expected an SDFormat file, with a name that ends in .sdf")
-    return path
+    return str(Path(path).absolute())
 
 
-def _shorten(error: Exception) -> str:
-    """Return an error of Drake's as one line."""
-    return " ".join(str(error).split())
+@contextmanager
+def _refuse_failures(name: str, path: str) -> Iterator[None]:
+    """Turn a failure of Drake's over the file into an InputError of one line."""
+    try:
+        yield
+    except (RuntimeError, SystemExit) as error:  # pydrake makes a SystemExit of a failed DRAKE_DEMAND
+        text = _rename(str(error), path, name).replace("error: ", "")
+        text = re.sub(r"Failure at \S+ in (\w+)\(\): (.*)", r"Drake's \1 refuses a number in it: \2", text)
+        raise InputError(text if text.startswith(name) else f"{name}: {text}") from None
+
+
+def _rename(text: str, path: str, name: str) -> str:
+    """Return a message of Drake's as one line, with the file named as the user does."""
+    folder, _, file = path.rpartition("/")
+    return re.sub(f"/*{re.escape(folder)}/+{re.escape(file)}", lambda _: name, " ".join(text.split()))
 
 
 @contextmanager
@@ -143,7 +153,7 @@ def _hear_drake() -> Iterator[list[str]]:
     class Collector(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
             if record.levelno >= logging.WARNING:
-                heard.append(_shorten_path(record.getMessage()))
+                heard.append(record.getMessage())
 
     log = logging.getLogger("drake")
     handlers, propagate = log.handlers, log.propagate
@@ -154,15 +164,11 @@ def _hear_drake() -> Iterator[list[str]]:
         log.handlers, log.propagate = handlers, propagate
 
 
-def _shorten_path(message: str) -> str:
-    return " ".join(message.replace("warning: ", "").split())
-
-
-def _refuse_bad_warnings(warnings: list[str]) -> None:
-    """Refuse what Drake only warns of although the file then means something else than it says."""
-    bad = [text for text in warnings if "SDFormat Error" in text or "invalid inertia" in text]
-    if bad:
-        raise InputError("\n".join(bad))
+def _refuse_bad_warnings(warnings: list[str], name: str) -> None:
+    """Refuse what Drake only warns of although the model then has other numbers than the file."""
+    for text in warnings:
+        if "SDFormat Error" in text or "invalid inertia" in text or "central inertia" in text:
+            raise InputError(text if text.startswith(name) else f"{name}: {text}")
 
 
 # -- the file as Drake reads it

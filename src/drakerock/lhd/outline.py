@@ -46,13 +46,6 @@ class _Element:
         for child in self.children:
             yield from child.walk()
 
-    def get_owner(self) -> str:
-        """Return the nearest named element around it, in words."""
-        element = self.parent
-        while element is not None and "name" not in element.attributes:
-            element = element.parent
-        return "the file" if element is None else f"{element.tag} '{element.attributes['name']}'"
-
 
 def _parse_xml(path: str, name: str) -> _Element:
     """Return the root element (ElementTree tells no lines)."""
@@ -179,10 +172,11 @@ class Outline:
 
     def _find_dropped(self, element: _Element) -> Iterator[str]:
         parent = element.parent
-        where, owner = f"{self.name}:{element.line}", element.get_owner()
+        # Drake's words, where it has any.
+        told = f"{self.name}:{element.line}: Ignoring unsupported SDFormat element in"
         if parent is not None and (parent.tag, element.tag) in _DROPPED and element.text.strip() != "0":
-            yield f"{where}: Drake ignores <{element.tag}> in <{parent.tag}> of {owner}"
+            yield f"{told} {parent.tag}: {element.tag}"
         if element.tag == "inertial" and element.attributes.get("auto", "false") in ("true", "1"):
-            yield f"{where}: Drake ignores auto of <inertial> of {owner}"
+            yield f"{told} inertial: auto"
         if element.tag == "screw_thread_pitch" and parent and parent.attributes.get("type") != "screw":
-            yield f"{where}: Drake ignores <screw_thread_pitch> of {owner}"
+            yield f"{told} joint: screw_thread_pitch"

@@ -29,6 +29,8 @@ _FORMAT = 1
 _GRID_STEP = 0.08
 # No boom or bucket turns further than this from where a search begins [rad].
 _FARTHEST = np.pi
+# A linkage that cannot be closed further, with this much left to its stops [m or rad], toggles.
+_TOGGLE_MARGIN = 1e-3
 
 
 def find_range(plant: MultibodyPlant, machine: Machine, phi_l: float, phi_b: float) -> Array:
@@ -66,6 +68,7 @@ def trace_range(plant: MultibodyPlant, machine: Machine, phi_l: float, phi_b: fl
 class _Tracer:
     def __init__(self, plant: MultibodyPlant, machine: Machine) -> None:
         self._name = machine.config.model
+        self._open = False  # whether the loops could not be closed somewhere in the search under way
         self._linkage = Linkage(plant, plant.CreateDefaultContext(), machine.instance, machine.loops)
 
     def trace(self, phi_l: float, phi_b: float) -> list[tuple[float, float, float]]:
@@ -107,12 +110,11 @@ class _Tracer:
         )
 
     def _calc_margin(self, phi_l: float, phi_b: float) -> float:
-        if not self._linkage.move(0.0, phi_l, phi_b):
-            raise InputError(
-                f"{self._name}: the linkage toggles before it meets a stop, "
-                f"near phi_l = {phi_l:.2f}, phi_b = {phi_b:.2f}"
-            )
-        return self._linkage.calc_margin()
+        """Return the distance from the stops there [m or rad]; where the loops cannot be closed, well beyond."""
+        if self._linkage.move(0.0, phi_l, phi_b):
+            return self._linkage.calc_margin()
+        self._open = True
+        return -1.0
 
     def _find_stop(self, start: tuple[float, float], direction: tuple[float, float], what: str) -> float:
         """Return how far one can go from `start` along `direction` to a stop."""
@@ -122,12 +124,20 @@ class _Tracer:
         def calc_margin(s: float) -> float:
             return self._calc_margin(start[0] + s * direction[0], start[1] + s * direction[1])
 
+        self._open = False
         far = _GRID_STEP
         while calc_margin(far) > 0:
             far += _GRID_STEP
             if far > _FARTHEST:
                 raise self._miss_stop(what)
-        return float(brentq(calc_margin, far - _GRID_STEP, far, xtol=1e-6))
+        stop = float(brentq(calc_margin, far - _GRID_STEP, far, xtol=1e-6))
+        if self._open and calc_margin(stop - 2e-6) > _TOGGLE_MARGIN:
+            raise InputError(
+                f"{self._name}: the linkage toggles before it meets a stop, near phi_l = "
+                f"{start[0] + stop * direction[0]:.2f}, phi_b = {start[1] + stop * direction[1]:.2f}: give the "
+                "cylinders stops that keep it from there"
+            )
+        return stop
 
     def _make_row(self, phi_l: float, phi_b: float) -> tuple[float, float, float]:
         tilt = phi_b - self._find_stop((phi_l, phi_b), (0.0, -1.0), "bucket")

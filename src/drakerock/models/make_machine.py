@@ -423,7 +423,7 @@ def make_transform(p: Any, pitch: float = 0.0) -> np.ndarray:
     """Return the (4, 4) transform of a translation and a rotation about y."""
     X = np.eye(4)
     c, s = math.cos(pitch), math.sin(pitch)
-    X[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    X[:3, :3] = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     X[:3, 3] = p
     return X
 

@@ -16,7 +16,23 @@ from drakerock.lhd.model import add_machine
 from drakerock.lhd.placement import set_machine_pose
 from drakerock.resources import find_data
 
-NUMBERS = ("0", "-1", "1", "0.5", "1e-9", "1e9", "-1e9", "nan", "inf", "-inf", "word", "", "1 2", "0 0 1", "1e400")
+NUMBERS = (
+    "0",
+    "-1",
+    "1",
+    "0.5",
+    "1e-9",
+    "1e9",
+    "-1e9",
+    "nan",
+    "inf",
+    "-inf",
+    "word",
+    "",
+    "1 2",
+    "0 0 1",
+    "1e400",
+)
 
 
 def mutate(rng: np.random.Generator) -> str:
@@ -29,6 +45,8 @@ def mutate(rng: np.random.Generator) -> str:
     for _ in range(rng.integers(1, 4)):
         parents = {child: parent for parent in root.iter() for child in parent}
         # Every kind of element is as likely as any other.
+        if not parents:
+            break
         tags = sorted({element.tag for element in parents})
         tag = tags[rng.integers(len(tags))]
         same = [element for element in parents if element.tag == tag]
@@ -42,17 +60,22 @@ def mutate(rng: np.random.Generator) -> str:
 
 
 def _change(
-    rng: np.random.Generator, element: ET.Element, parents: dict[ET.Element, ET.Element], all_: list[ET.Element]
+    rng: np.random.Generator,
+    element: ET.Element,
+    parents: dict[ET.Element, ET.Element],
+    all_: list[ET.Element],
 ) -> None:
     parent, other = parents[element], all_[rng.integers(len(all_))]
-    match rng.integers(8):
+    match rng.integers(14):
         case 0:
             parent.remove(element)
         case 1:
             parent.append(element)
         case 2 if element.attrib:
             key = sorted(element.attrib)[rng.integers(len(element.attrib))]
-            element.set(key, str(rng.choice(["", "world", "boom", "x y", "__model__", "nan", other.get("name", "z")])))
+            element.set(
+                key, str(rng.choice(["", "world", "boom", "x y", "__model__", "nan", other.get("name", "z")]))
+            )
         case 3:
             element.tag = other.tag
         case 4:
@@ -63,8 +86,16 @@ def _change(
         case _:
             words = (element.text or "").split()
             if words:
-                words[rng.integers(len(words))] = str(rng.choice(NUMBERS))
+                k = rng.integers(len(words))
+                words[k] = _scale(rng, words[k]) if rng.random() < 0.6 else str(rng.choice(NUMBERS))
                 element.text = " ".join(words)
+
+
+def _scale(rng: np.random.Generator, word: str) -> str:
+    try:
+        return f"{float(word) * rng.choice([-1, 0.5, 0.9, 0.99, 1.01, 1.1, 2, 10]):.9g}"
+    except ValueError:
+        return word
 
 
 def use(file: Path) -> None:
