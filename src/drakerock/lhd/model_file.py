@@ -167,7 +167,11 @@ def _hear_drake() -> Iterator[list[str]]:
 def _refuse_bad_warnings(warnings: list[str], name: str) -> None:
     """Refuse what Drake only warns of although the model then has other numbers than the file."""
     for text in warnings:
-        if "SDFormat Error" in text or "invalid inertia" in text or "central inertia" in text:
+        if "central inertia" in text:
+            raise InputError(
+                f"{text.split(' ')[0]} <inertial> has no <mass> above 0 or no <inertia> of a body"
+            )
+        if "SDFormat Error" in text or "invalid inertia" in text:
             raise InputError(text if text.startswith(name) else f"{name}: {text}")
 
 

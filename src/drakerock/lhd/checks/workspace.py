@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from drakerock.lhd import names
 from drakerock.lhd.checks.bench import Bench
-from drakerock.lhd.checks.rows import CheckRow, compare, require
-from drakerock.lhd.checks.trials import set_angles
+from drakerock.lhd.checks.clearance import check_clearance
+from drakerock.lhd.checks.rows import CheckRow, compare
 from drakerock.lhd.config import MachineData
 from drakerock.lhd.geometry import calc_heaped_capacity
 from drakerock.lhd.kinematics import (
@@ -54,7 +53,7 @@ def check_geometry(bench: Bench, data: MachineData) -> list[CheckRow]:
         ),
         CheckRow("tip, highest (tilted, boom up)", float(top[1]), "m"),
         CheckRow("tip, dumped with the boom up", float(low[1]), "m"),
-        require("clearance of the bucket to tyres and front unit", _calc_clearance(bench), "m", 0.0),
+        *check_clearance(bench),
         compare(
             f"r_ft on a slope of {data.reach_slope_deg:g} deg",
             calc_reach(kin, float(np.radians(data.reach_slope_deg))),
@@ -63,20 +62,3 @@ def check_geometry(bench: Bench, data: MachineData) -> list[CheckRow]:
             0.05,
         ),
     ]
-
-
-def _calc_clearance(bench: Bench) -> float:
-    """Return the smallest distance [m] of the bucket at its stops from the front unit and its wheels."""
-    plant, kin, context = bench.plant, bench.kin, bench.plant_context
-    others = ("front_unit", *names.WHEELS[:2])
-    bucket = plant.GetCollisionGeometriesForBody(bench.get_body("bucket"))
-    chassis = [g for name in others for g in plant.GetCollisionGeometriesForBody(bench.get_body(name))]
-    distances = []
-    for phi_l in kin.phi_l_grid:
-        for phi_b in calc_bucket_range(kin, phi_l):
-            set_angles(bench, float(phi_l), float(phi_b))
-            query = plant.get_geometry_query_input_port().Eval(context)
-            distances += [
-                query.ComputeSignedDistancePairClosestPoints(a, b).distance for a in bucket for b in chassis
-            ]
-    return float(min(distances))
