@@ -78,7 +78,7 @@ def _find_linkage(plant: MultibodyPlant, machine: Machine) -> list[RigidBody]:
 def _add_looks(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> list[GeometryId]:
     """Give a body contact shapes out of its visual meshes; return them."""
     inspector = scene_graph.model_inspector()
-    found = []
+    found: list[GeometryId] = []
     for look in plant.GetVisualGeometriesForBody(body):
         shape = inspector.GetShape(look)
         if not isinstance(shape, Mesh) or not shape.source().is_path():
