@@ -193,7 +193,8 @@ def machine_check(
 
     Example: drakerock machine check studies/demo.yaml
     """
-    from drakerock.lhd.checks.checks import make_check_data, make_check_table, run_machine_checks
+    from drakerock.lhd.checks.checks import run_machine_checks
+    from drakerock.lhd.checks.rows import make_check_data, make_check_table
 
     with _show_progress("machine check"):
         rows = run_machine_checks(_load(scenario, None, set_).machine)

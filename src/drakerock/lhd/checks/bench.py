@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
+from pydantic import Field
 from pydrake.common.value import Value
 from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, SceneGraph, Shape
 from pydrake.math import RigidTransform
@@ -23,8 +24,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from shapely import Polygon
 
+from drakerock.config import Config
 from drakerock.lhd import names
-from drakerock.lhd.config import CheckConfig, MachineConfig
+from drakerock.lhd.config import MachineConfig
 from drakerock.lhd.geometry import BucketGeometry, calc_area, make_bucket_geometry, read_profile
 from drakerock.lhd.hinge import HingeMoment, add_hinge_moment
 from drakerock.lhd.kinematics import Kinematics, make_kinematics
@@ -34,6 +36,16 @@ from drakerock.lhd.model import Machine, add_machine, calc_motor_targets
 Array = np.ndarray
 
 _HALF_FLOOR = (60.0, 20.0, 5.0)
+
+
+class CheckConfig(Config):
+    """The bench on which the machine is checked."""
+
+    time_step: float = Field(default=0.01, gt=0, description="of the plant [s]")
+    contact_approximation: str = Field(default="lagged", pattern="^(lagged|similar|sap)$")
+    floor_friction: float = Field(default=1.125, gt=0, description="of the floor; tyres bring their own")
+    floor_stiffness: float = Field(default=1e10, gt=0, description="of floor and obstacles [N/m]")
+    floor_dissipation: float = Field(default=1.0, ge=0, description="of floor and obstacles [s/m]")
 
 
 @dataclass(frozen=True)
