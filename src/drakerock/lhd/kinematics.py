@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 from scipy.optimize import brentq
 
+from drakerock.errors import InputError
 from drakerock.lhd.model import Machine
 from drakerock.lhd.tracing import find_range
 
@@ -179,6 +180,9 @@ def calc_reach(kin: Kinematics, slope: float) -> float:
     """Return r_ft [m]: how far up a plane slope [rad] the tip of the level bucket gets.
 
     The front wheels touch the slope's front; measured along the slope from its toe (section 5).
+
+    Raises:
+        InputError: the tip does not meet the slope at any boom angle.
     """
     # Wheel on the floor and against the slope: the toe lies this far ahead of the axle.
     x_toe = kin.wheel_radius * np.tan(slope / 2)
@@ -187,5 +191,8 @@ def calc_reach(kin: Kinematics, slope: float) -> float:
         x, z = calc_tip(kin, 0.0, phi_l, kin.phi_level - phi_l)
         return float(z - (x - x_toe) * np.tan(slope))
 
+    ends = [calc_height_above_slope(float(phi_l)) for phi_l in kin.phi_l_range]
+    if np.prod(ends) > 0:
+        raise InputError(f"the tip of the level bucket does not meet a slope of {np.degrees(slope):.3g} deg")
     phi_l = brentq(calc_height_above_slope, *kin.phi_l_range)
     return float((calc_tip(kin, 0.0, phi_l, kin.phi_level - phi_l)[0] - x_toe) / np.cos(slope))

@@ -25,6 +25,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from shapely import Polygon
 
 from drakerock.config import Config
+from drakerock.errors import SimulationFailure
 from drakerock.lhd import names
 from drakerock.lhd.config import MachineConfig
 from drakerock.lhd.geometry import BucketGeometry, calc_area, make_bucket_geometry, read_profile
@@ -96,7 +97,11 @@ class Bench:
         self.plant.get_applied_spatial_force_input_port().FixValue(self.plant_context, Value([load]))
 
     def run(self, duration: float, *, wheel: float = 0.0, boom: float = 0.0, bucket: float = 0.0) -> Record:
-        """Run with constant motor targets [rad/s] for `duration` [s] and record every step."""
+        """Run with constant motor targets [rad/s] for `duration` [s] and record every step.
+
+        Raises:
+            SimulationFailure: a step could not be solved.
+        """
         plant, machine = self.plant, self.machine
         context, root = self.plant_context, self.context
         targets = calc_motor_targets(plant, machine, wheel, boom, bucket)
@@ -108,7 +113,10 @@ class Bench:
         wall = 0.0
         for k in range(1, steps + 1):
             begin = perf_counter()
-            self.simulator.AdvanceTo((start + k) * plant.time_step())
+            try:
+                self.simulator.AdvanceTo((start + k) * plant.time_step())
+            except RuntimeError as error:
+                raise SimulationFailure(f"{machine.config.model}: the bench's step failed: {error}") from None
             wall += perf_counter() - begin
             columns["time"].append(root.get_time())
             columns["q"].append(plant.GetPositions(context, machine.instance))
