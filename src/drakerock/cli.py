@@ -119,6 +119,9 @@ def load(
         bool, typer.Option(help="Write replay.html, of each loading; about 13 MB at full size.")
     ] = True,
     figures: Annotated[bool, typer.Option("--figures", help="Write the pictures, too, as PNG.")] = False,
+    meshcat: Annotated[
+        bool, typer.Option("--meshcat", help="Show the cycle in a browser while it is computed.")
+    ] = False,
     seed: SeedOption = None,
     set_: SetOption = None,
     json_: JsonOption = False,
@@ -136,6 +139,8 @@ def load(
     if plan is not None:
         overrides.append(f"loading.planning.source={json.dumps(str(plan))}")
     config = _load(scenario, seed, [*(set_ or []), *overrides])
+    if meshcat and loadings is not None:
+        raise InputError("--meshcat: shows one cycle; leave out --loadings")
     if loadings is not None:
         with _show_progress("load") as advance:
             summary, paths = run_and_save_sequence(
@@ -149,13 +154,16 @@ def load(
         if summary["failed"]:
             raise SimulationFailure(summary["reasons"][-1])
         return
+    live = _start_meshcat() if meshcat else None
     with _show_progress("load") as advance:
-        result, paths = run_and_save(config, out, advance, replay=replay, figures=figures)
+        result, paths = run_and_save(config, out, advance, replay=replay, figures=figures, meshcat=live)
     if json_:
         print(result.to_json(), end="")
     else:
         _print_outcome(result)
         _print_paths(paths)
+    if live and sys.stdin.isatty():
+        input("Press Enter to close the live view. ")
     if result.status == "failed":
         raise SimulationFailure(result.reason)
 
@@ -404,6 +412,18 @@ def schema(kind: Annotated[FileKind, typer.Argument(help="Which files.")]) -> No
 
     described = Scenario if kind == FileKind.scenario else StudyConfig
     print(json.dumps(make_json_schema(described, f"drakerock {kind}"), indent=2))
+
+
+def _start_meshcat() -> Any:
+    """Return a Meshcat server whose address is printed."""
+    from pydrake.geometry import Meshcat
+
+    try:
+        meshcat = Meshcat()
+    except RuntimeError as error:
+        raise InputError(f"--meshcat: no server can be started: {error}") from None
+    output.print(f"live view: {meshcat.web_url()}")
+    return meshcat
 
 
 def _load(path: Path | None, seed: int | None, overrides: list[str] | None) -> Any:

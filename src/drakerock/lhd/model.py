@@ -15,7 +15,6 @@ from drakerock.errors import InputError
 from drakerock.lhd import names
 from drakerock.lhd.config import MachineConfig, MotorConfig
 from drakerock.lhd.model_file import Loop, check_machine_file, parse_machine
-from drakerock.rocks.drake.plant_view import BallConstraint
 
 
 @dataclass(frozen=True)
@@ -108,19 +107,6 @@ def calc_motor_targets(
     ]
     positions = [machine.steering_angle if name == "articulation" else 0.0 for name in joints]
     return np.array(positions + [rates.get(name, wheel) for name in joints])
-
-
-def find_ball_constraints(plant: MultibodyPlant, machine: Machine) -> list[BallConstraint]:
-    """Return the linkage's closed loops as `AddRocks` wants them."""
-    return [
-        BallConstraint(
-            plant.GetBodyByName(loop.body_A, machine.instance).index(),
-            np.array(loop.p_AP),
-            plant.GetBodyByName(loop.body_B, machine.instance).index(),
-            np.array(loop.p_BQ),
-        )
-        for loop in machine.loops
-    ]
 
 
 @cache

@@ -36,7 +36,7 @@ from drakerock.lhd import names
 from drakerock.lhd.config import MachineConfig, MotorConfig
 from drakerock.lhd.outline import Outline
 from drakerock.resources import find_data
-from drakerock.rocks.ball_constraints import read_ball_constraints
+from drakerock.rocks.drake.ball_constraints import read_ball_constraints
 
 Array = np.ndarray
 

@@ -8,7 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
 from drakerock.lhd.geometry import collision_pieces, find_pads
-from drakerock.lhd.model import Machine, find_ball_constraints
+from drakerock.lhd.model import Machine
 from drakerock.rocks.config import RocksConfig, SiteConfig
 from drakerock.rocks.drake.add_rocks import AddRocks
 from drakerock.rocks.drake.interface import RockSystem
@@ -61,7 +61,6 @@ def add_lhd_rocks(
         shapes=shapes,
         bounds=calc_bounds(site),
         wake_boxes=[make_wake_box(plant, scene_graph, machine, dynamics.nonsmooth.rest)],
-        loops=find_ball_constraints(plant, machine),
         ignored=find_pads(plant, scene_graph, machine),
         stiction_tolerance=dynamics.stiction_tolerance,
         visible=visible,

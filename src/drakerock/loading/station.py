@@ -94,6 +94,7 @@ class Station:
         """
         loading = self.scenario.loading
         root_context.SetTimeStateAndParametersFrom(self.diagram.CreateDefaultContext())
+        self.rocks.set_pile(root_context, self.rocks.pile)
         self._place(root_context, x_tip=-loading.sensing.scanner.distance, y=0.0)
         for part in (self.sensor, self.planner):
             part.ExecuteInitializationEvents(part.GetMyMutableContextFromRoot(root_context))

@@ -18,7 +18,7 @@ from drakerock.lhd.kinematics import make_kinematics
 from drakerock.lhd.model import Machine, add_machine
 from drakerock.lhd.model_file import check_machine_file
 from drakerock.resources import find_data
-from drakerock.rocks.ball_constraints import read_ball_constraints
+from drakerock.rocks.drake.ball_constraints import read_ball_constraints
 
 from .mutations import mutate, use
 

@@ -16,7 +16,7 @@ from drakerock.rocks.config import RocksConfig
 from drakerock.rocks.drake.geometry import PlantGeometry, read_plant_geometry
 from drakerock.rocks.drake.interface import RockSystem
 from drakerock.rocks.drake.plant_engine import PlantRocks, RockBodies
-from drakerock.rocks.drake.plant_view import BallConstraint, PlantView, WakeBox
+from drakerock.rocks.drake.plant_view import PlantView, WakeBox
 from drakerock.rocks.drake.scene import add_rock_poses
 from drakerock.rocks.drake.system import NonsmoothRocks
 from drakerock.rocks.engine.config import NonsmoothConfig
@@ -43,7 +43,6 @@ def AddRocks(
     shapes: tuple[RockShape, ...] | None = None,
     bounds: tuple[ArrayLike, ArrayLike] | None = None,
     wake_boxes: Sequence[WakeBox] | None = None,
-    loops: Sequence[BallConstraint] = (),
     ignored: Sequence[GeometryId] = (),
     stiction_tolerance: float = STICTION_TOLERANCE,
     visible: bool = True,
@@ -52,7 +51,8 @@ def AddRocks(
     """Add rocks to a Diagram and connect them with its plant: call it last, just before the Diagram is built.
 
     Rocks meet every proximity geometry of the plant: bodies that are welded to the world stand still, all others,
-    of any number of models, take part in the contact solve with their inertia, motors, stops and own contacts.
+    of any number of models, take part in the contact solve with their inertia, motors, stops, closed loops (ball
+    constraints) and own contacts.
     Gravity and time step are the plant's. The rocks' forces reach the plant in the same step, beside the applied
     forces of others.
 
@@ -73,7 +73,6 @@ def AddRocks(
             resting bodies, 20 m wider to all sides.
         wake_boxes: where bodies keep the rocks around them awake; default: the box of each body that moves,
             `rest.sensor_margin` wider.
-        loops: the plant's ball constraints, which Drake does not tell in Python.
         ignored: proximity geometries that rocks do not meet.
         stiction_tolerance: the plant's, if it was changed [m/s].
         visible: register the rocks with `scene_graph` (illustration and perception); where they are is told only when
@@ -111,7 +110,7 @@ def AddRocks(
     if geometry.bodies:
         if wake_boxes is None:
             wake_boxes = _make_wake_boxes(geometry, settings.rest.sensor_margin)
-        view = builder.AddSystem(PlantView(plant, geometry.bodies, wake_boxes, loops, stiction_tolerance))
+        view = builder.AddSystem(PlantView(plant, geometry.bodies, wake_boxes, stiction_tolerance))
         _connect_view(builder, plant, view)
         builder.Connect(view.GetOutputPort("plant_step"), rocks.GetInputPort("plant_step"))
     _connect_forces(builder, plant, rocks)

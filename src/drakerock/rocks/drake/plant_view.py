@@ -27,7 +27,9 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlan
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, ModelInstanceIndex, MultibodyForces
 from pydrake.systems.framework import Context, InputPort, LeafSystem, ValueProducer
 
+from drakerock.errors import InputError
 from drakerock.memory import weak
+from drakerock.rocks.drake.ball_constraints import BallConstraint, read_ball_constraints
 from drakerock.rocks.drake.geometry import Material, read_material
 from drakerock.rocks.engine.engine import MachineStep, make_machineless_step
 from drakerock.rocks.engine.machine_step import (
@@ -43,21 +45,6 @@ _log = logging.getLogger(__name__)
 
 # Within this distance of its stop a joint has a row for it [rad, m].
 STOP_MARGIN = 0.05
-
-
-@dataclass(frozen=True, eq=False)
-class BallConstraint:
-    """Two points of two bodies that stay together: a closed loop (Drake does not tell them in Python).
-
-    Attributes:
-        body_A, body_B: the bodies.
-        p_AP, p_BQ: (3,) the points in the bodies' frames [m].
-    """
-
-    body_A: BodyIndex
-    p_AP: Array
-    body_B: BodyIndex
-    p_BQ: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +79,6 @@ class PlantView(LeafSystem):
         plant: MultibodyPlant,
         bodies: Sequence[BodyIndex],
         wake_boxes: Sequence[WakeBox],
-        loops: Sequence[BallConstraint],
         stiction_tolerance: float,
     ) -> None:
         """Make it.
@@ -101,7 +87,6 @@ class PlantView(LeafSystem):
             plant: finalized.
             bodies: those with proximity geometry that are not welded to the world.
             wake_boxes: where bodies keep rocks awake.
-            loops: the plant's closed loops.
             stiction_tolerance: the plant's [m/s].
         """
         super().__init__()
@@ -115,17 +100,10 @@ class PlantView(LeafSystem):
             (self._number[int(box.body)], np.concatenate([box.lower, box.upper])) for box in wake_boxes
         ]
         self._loop_points = [
-            (body, np.asarray(p, float))
-            for loop in loops
+            (body.index(), p)
+            for loop in _find_loops(plant)
             for body, p in ((loop.body_A, loop.p_AP), (loop.body_B, loop.p_BQ))
         ]
-        if plant.num_constraints() > len(loops):
-            _log.warning(
-                "the plant has %d constraints, and rocks are told of %d: its bodies obey the others only after the "
-                "rocks have met them; give AddRocks its ball constraints (loops)",
-                plant.num_constraints(),
-                len(loops),
-            )
         self._materials: dict[int, tuple[int | None, Material]] = {}
         self._motors = _find_motors(plant)
         self._stops = _find_stops(plant)
@@ -335,6 +313,14 @@ class _Stop:
     velocity_start: int
     side: float
     limit: float
+
+
+def _find_loops(plant: MultibodyPlant) -> tuple[BallConstraint, ...]:
+    try:
+        return read_ball_constraints(plant)
+    except InputError as error:
+        _log.warning("%s: rocks meet the plant's bodies as if its constraints were not there", error)
+        return ()
 
 
 def _find_motors(plant: MultibodyPlant) -> Sequence[_Motor]:
