@@ -232,9 +232,10 @@ class _Runner:
         sequence = self._running.pop(task.point)
         self._record(sequence)
         if isinstance(result, WorkerLost):
-            self._store.add_event("worker lost", f"{task.point} attempt {task.attempt}")
-            if self._display:
-                self._display.say(f"{task.point}: {result}")
+            if result.deaths:
+                self._store.add_event("worker lost", f"{task.point} attempt {task.attempt}")
+                if self._display:
+                    self._display.say(f"{task.point}: {result}")
             if sequence.n_recorded > sequence.n_before:
                 # Of workers that a scheduler of others tried on end, some have finished cycles.
                 result.deaths = min(result.deaths, 1)
