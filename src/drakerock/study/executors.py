@@ -20,7 +20,7 @@ from typing import Any
 from drakerock.errors import DrakerockError, InputError, RunStopped
 from drakerock.study.main_guard import check_main_guard
 from drakerock.study.schema import ExecutorConfig, SlurmConfig
-from drakerock.study.work import Task, TaskResult, has_begun, mark_waiting, run_task
+from drakerock.study.work import Task, TaskResult, count_begun, mark_waiting, run_task
 from drakerock.study.worker_setup import silence_closing
 
 # One thread each: the simulation is sequential, and there is a process for every core.
@@ -210,11 +210,10 @@ class DaskExecutor(Executor):
 
         try:
             result = future.result(timeout=30)
-        except KilledWorker as error:
+        except KilledWorker:
             task = self._futures.pop(future)
-            # The scheduler of others may have tried it on several workers before it gave up.
-            deaths = error.allowed_failures + 1 if has_begun(task) else 0
-            return task, WorkerLost("the worker died (killed, or out of memory)", deaths)
+            # A scheduler of others may have tried it on several workers before it gave up.
+            return task, WorkerLost("the worker died (killed, or out of memory)", count_begun(task))
         except (CancelledError, FutureCancelledError, OSError, TimeoutError):
             raise RunStopped("the scheduler was lost") from None
         except Exception as error:  # whatever Dask meets; what the work meets is in its result

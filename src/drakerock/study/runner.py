@@ -28,7 +28,7 @@ from drakerock.study.executors import Executor, Losses, WorkerLost, make_executo
 from drakerock.study.schema import StudyConfig
 from drakerock.study.status import read_status
 from drakerock.study.tables import export_tables, read_responses
-from drakerock.study.work import Task, TaskResult
+from drakerock.study.work import Task, TaskResult, count_begun
 
 RUN_SEQUENCE = "drakerock.loading.sequence:run_sequence"
 _POLL = 0.5
@@ -210,7 +210,7 @@ class _Runner:
 
     def _run(self, executor: Executor, sequence: _Sequence) -> None:
         self._running[sequence.task.point] = sequence
-        sequence.n_before = sequence.n_recorded
+        sequence.n_forgiven = 0
         executor.submit(sequence.task)
 
     def _look(self) -> None:
@@ -226,18 +226,20 @@ class _Runner:
         n = self._store.record_cycles(task.point, task.attempt, sequence.n_recorded, now - sequence.since)
         if n > sequence.n_recorded:
             sequence.n_recorded, sequence.since = n, now
-            sequence.losses = Losses(sequence.losses.limit)
+            sequence.losses, sequence.n_forgiven = (
+                Losses(sequence.losses.limit),
+                max(count_begun(task) - 1, 0),
+            )
 
     def _take(self, task: Task, result: TaskResult | WorkerLost) -> None:
         sequence = self._running.pop(task.point)
         self._record(sequence)
         if isinstance(result, WorkerLost):
-            self._store.add_event("worker lost", f"{task.point} attempt {task.attempt}")
-            if self._display:
-                self._display.say(f"{task.point}: {result}")
-            if sequence.n_recorded > sequence.n_before:
-                # Of workers that a scheduler of others tried on end, some have finished cycles.
-                result.deaths = min(result.deaths, 1)
+            if result.deaths:
+                self._store.add_event("worker lost", f"{task.point} attempt {task.attempt}")
+                if self._display:
+                    self._display.say(f"{task.point}: {result}")
+            result.deaths = max(result.deaths - sequence.n_forgiven, 0)
             failure = sequence.losses.add(result)
             if failure is None:
                 # Not at once: a worker is missing, and behind a running task it would wait for the others.
@@ -265,10 +267,17 @@ class _Runner:
 
 
 class _Sequence:
-    """A sequence that has begun: its task, the cycles recorded now and at its submission, its losses."""
+    """A sequence that has begun.
+
+    Attributes:
+        task: what was submitted.
+        n_recorded, since: cycles recorded, and when the last was [s].
+        losses: the workers lost since then.
+        n_forgiven: workers lost since the submission, but before the last cycle was recorded.
+    """
 
     def __init__(self, task: Task, n_recorded: int, max_deaths: int) -> None:
-        self.task, self.n_recorded, self.n_before = task, n_recorded, n_recorded
+        self.task, self.n_recorded, self.n_forgiven = task, n_recorded, 0
         self.since = time.monotonic()
         self.losses = Losses(max_deaths)
 

@@ -166,22 +166,22 @@ def _count_good(task: Task) -> tuple[int, str]:
 
 
 def mark_waiting(task: Task) -> None:
-    """Note that a task has not begun; `run_task` notes that it has."""
+    """Note that a task has not begun; `run_task` notes each time that it has."""
     with suppress(OSError):  # trouble with the disk is for the worker to tell
         _find_lock(task).parent.mkdir(parents=True, exist_ok=True)
         _find_lock(task).write_text("")
 
 
-def has_begun(task: Task) -> bool:
-    """Return whether a task has begun since `mark_waiting`."""
+def count_begun(task: Task) -> int:
+    """Return how often a task has begun since `mark_waiting`: more than once where a scheduler has tried it again."""
     try:
-        return bool(_find_lock(task).read_text())
+        return len(_find_lock(task).read_text().splitlines())
     except OSError:
-        return True
+        return 1
 
 
 def _find_lock(task: Task) -> Path:
-    """Return the file that a worker holds while it runs the task, and that says which worker it was."""
+    """Return the file that a worker holds while it runs the task, and that says which workers did."""
     return task.folder.with_suffix(".lock")
 
 

@@ -12,6 +12,7 @@ import study_work
 from drakerock.config import parse_config
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.table import ResponseTable
+from drakerock.study import db
 from drakerock.study.db import Store
 from drakerock.study.executors import make_slurm_cluster
 from drakerock.study.resimulation import Resimulation
@@ -117,6 +118,34 @@ def test_a_study_can_grow_but_not_change(copy):
     assert status["points"]["done"] == 24
     old, new = ResponseTable.load(copy).select("sample"), ResponseTable.load(copy)
     assert np.array_equal(old.X[:16], new.select("sample").X[:16])
+
+
+def test_a_study_whose_files_or_program_changed_is_another(tmp_path, monkeypatch):
+    model = tmp_path / "machine.sdf"
+    model.write_text("<sdf/>")
+    study = make_study(f"scenario.machine.model={model}")
+    Store.create(tmp_path / "store", study).close()
+    Store.create(tmp_path / "store", study).close()
+    same = shutil.copy(model, tmp_path / "copy.sdf")
+    Store.create(tmp_path / "store", make_study(f"scenario.machine.model={same}")).close()
+    with monkeypatch.context() as patch:
+        patch.setattr(db, "RESULTS_REVISION", db.RESULTS_REVISION + 1)
+        with pytest.raises(InputError, match=r"another study \(different: results revision\)"):
+            Store.create(tmp_path / "store", study)
+    model.write_text("<sdf></sdf>")
+    with pytest.raises(InputError, match=r"another study \(different: scenario\.machine\.model\)"):
+        Store.create(tmp_path / "store", study)
+
+
+def test_a_store_of_an_earlier_version_can_be_read_not_resumed(copy):
+    with Store.create(copy, make_study()) as store, store.transaction() as connection:
+        connection.execute("DELETE FROM meta")
+        connection.execute("PRAGMA user_version = 1")
+    with Store.open(copy) as store:
+        assert read_status(store)["complete"]
+        assert verify_store(store) == []
+    with pytest.raises(InputError, match="made by an earlier version"):
+        Store.create(copy, make_study())
 
 
 def test_grown_and_whole_are_the_same(tmp_path, copy):
