@@ -1,8 +1,10 @@
-"""Output folders and text files: made or written whole, or refused with one message."""
+"""Output folders and text files: made, read or written whole, or refused with one message."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 from drakerock.errors import InputError
 
@@ -30,3 +32,23 @@ def write_text(path: Path, text: str) -> None:
         partial.replace(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def read_json(path: Path) -> Any:
+    """Return what a JSON file holds.
+
+    Raises:
+        InputError: it cannot be read, or is no JSON that can be written as UTF-8 again.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        data = json.loads(text)
+        # A lone half of a surrogate pair can be read by its escape, and written nowhere.
+        json.dumps(data, ensure_ascii=False).encode()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not valid JSON: {error}") from None
+    return data

@@ -379,13 +379,14 @@ class Store:
             InputError: an objective's function failed.
         """
         problem = self.study.problem
-        functions = [get_objective(name) for name in self.study.objectives]
+        objectives = [get_objective(name) for name in self.study.objectives]
         names: list[str] = []
         loadings: list[float] = []
         X: list[Array] = []
         Y: list[list[float]] = []
         roles: list[str] = []
         failures: list[str] = []
+        failed: list[bool] = []
         rows: dict[tuple[str, int], list[tuple[int, str, str, str]]] = {}
         for point, attempt, *rest in self._db.execute(
             "SELECT point, attempt, loading, status, reason, outcome FROM cycles ORDER BY loading"
@@ -402,10 +403,11 @@ class Store:
                 loadings.append(loading)
                 X.append(point.x)
                 Y.append(
-                    [np.nan] * len(functions)
+                    [np.nan] * len(objectives)
                     if lost
-                    else [_evaluate(item.function, item.objective.name, outcome) for item in functions]
+                    else [item.evaluate(CycleOutcome.from_json(outcome)) for item in objectives]
                 )
+                failed.append(lost)
                 roles.append(point.role)
                 failures.append(reasons[point.name] if point.status == "failed" else reason)
         if not names:
@@ -413,13 +415,20 @@ class Store:
             return ResponseTable(problem, np.empty((0, d)), np.empty((0, k)))
         provenance = json.loads((self.folder / STUDY).read_text(encoding="utf-8"))
         return average_loadings(
-            problem, names, loadings, np.array(X), np.array(Y), roles, failures, provenance=provenance
+            problem,
+            names,
+            loadings,
+            np.array(X),
+            np.array(Y),
+            roles,
+            failures,
+            failed=failed,
+            provenance=provenance,
         )
 
     def read_loadings(self) -> pa.Table:
         """Return one row per recorded cycle, of all attempts: point, variables, objectives, outcome, cost."""
         problem, columns = self.study.problem, {}
-        functions = [get_objective(name) for name in self.study.objectives]
         points = {point.name: point for point in self.list_points()}
         rows = self._db.execute(
             "SELECT c.point, c.attempt, c.loading, c.status, c.reason, c.outcome, c.seconds, s.inputs_hash "
@@ -433,13 +442,12 @@ class Store:
             columns[name] = [row[j] for row in rows]
         for j, name in enumerate(problem.variable_names):
             columns[name] = [float(points[row[0]].x[j]) for row in rows]
-        for item in functions:
-            columns[item.objective.name] = [
-                None
-                if row[3] == "failed"
-                else _evaluate(item.function, item.objective.name, row[5], missing=None)
+        for item in [get_objective(name) for name in self.study.objectives]:
+            values = [
+                np.nan if row[3] == "failed" else item.evaluate(CycleOutcome.from_json(row[5]))
                 for row in rows
             ]
+            columns[item.objective.name] = pa.array(values, pa.float64(), from_pandas=True)
         for name in ("bucket_mass_kg", "bucket_rocks", "weighed_mass_kg", "loading_time_s", "energy_J",
                      "peak_push_force_N", "mean_push_force_N", "sim_time_s", "steps", "seed",
                      "scenario_hash", "wall_time_s"):  # fmt: skip
@@ -719,14 +727,6 @@ def _list_differences(one: Any, two: Any, prefix: str = "") -> list[str]:
         keys = sorted(set(one) | set(two))
         return [d for k in keys for d in _list_differences(one.get(k), two.get(k), f"{prefix}{k}.")]
     return [] if one == two else [prefix.rstrip(".")]
-
-
-def _evaluate(function: Any, name: str, outcome: str, missing: float | None = np.nan) -> Any:
-    try:
-        value = function(CycleOutcome.from_json(outcome))
-        return missing if value is None else float(value)
-    except Exception as error:  # whatever a user's function dies of
-        raise InputError(f"objective '{name}': {type(error).__name__}: {error}") from error
 
 
 def _hash_file(path: Path) -> str:

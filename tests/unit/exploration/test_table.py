@@ -149,8 +149,8 @@ class TestErrors:
             ResponseTable.load(path)
 
     def test_unknown_role(self, tmp_path):
-        path = self.write(tmp_path, self.header + "a,training,1,0,0,0,1,1,1\n")
-        with pytest.raises(InputError, match="role 'training' is not one of sample, validation"):
+        path = self.write(tmp_path, self.header + "a,spare,1,0,0,0,1,1,1\n")
+        with pytest.raises(InputError, match="role 'spare' is not one of sample, validation"):
             ResponseTable.load(path)
 
     def test_unreadable(self, tmp_path):
