@@ -34,8 +34,8 @@ def write_text(path: Path, text: str) -> None:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def read_json(path: Path) -> Any:
-    """Return what a JSON file holds.
+def read_json(path: Path, what: str = "valid JSON") -> Any:
+    """Return what a JSON file holds; `what` it should be is said where it is not.
 
     Raises:
         InputError: it cannot be read, or is no JSON that can be written as UTF-8 again.
@@ -50,5 +50,5 @@ def read_json(path: Path) -> Any:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid JSON: {error}") from None
+        raise InputError(f"{path}: not {what}: {error}") from None
     return data

@@ -300,6 +300,8 @@ def _find_header(path: Path, lines: Sequence[str], needed: Sequence[str]) -> tup
     for at, line in enumerate(lines):
         plain = line.strip(" \r\n")
         header = plain.lstrip("# ")
+        if re.fullmatch(r"sep=[,;\t]", plain, re.IGNORECASE):
+            continue  # a hint of spreadsheets to themselves
         try:
             (found, _), best = max((count(header, separator), separator) for separator in "\t;,")
         except csv.Error as error:

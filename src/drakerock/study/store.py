@@ -39,7 +39,7 @@ from drakerock.config import calc_config_hash
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.problem import Array
 from drakerock.exploration.table import ResponseTable, average_loadings
-from drakerock.files import make_folder, write_text
+from drakerock.files import make_folder, read_json, write_text
 from drakerock.loading.cycle import CycleOutcome
 from drakerock.loading.scenario import Scenario
 from drakerock.study.objectives import get_objective
@@ -598,11 +598,10 @@ def read_study(folder: str | Path) -> StudyConfig:
         InputError: no study there, or one that cannot be read.
     """
     path = Path(folder) / STUDY
+    data = read_json(path, "a readable study")
     try:
-        return StudyConfig.model_validate(json.loads(path.read_text(encoding="utf-8"))["study"])
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, ValueError, KeyError, TypeError, ValidationError) as error:
+        return StudyConfig.model_validate(data["study"])
+    except (KeyError, TypeError, ValidationError) as error:
         raise InputError(f"{path}: not a readable study: {str(error).splitlines()[0]}") from None
 
 
@@ -641,9 +640,10 @@ def read_outcome(path: Path) -> CycleOutcome:
     Raises:
         InputError: it cannot be read.
     """
+    data = read_json(path, "a readable outcome")
     try:
-        return CycleOutcome.from_json(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, TypeError) as error:
+        return CycleOutcome(**data)
+    except TypeError as error:
         raise InputError(f"{path}: not a readable outcome: {error}") from None
 
 
