@@ -42,7 +42,7 @@ def read_json(path: Path, what: str = "valid JSON") -> Any:
     """
     try:
         text = path.read_text(encoding="utf-8")
-        data = json.loads(text)
+        data = json.loads(text, parse_constant=_refuse_constant)
         # A lone half of a surrogate pair can be read by its escape, and written nowhere.
         json.dumps(data, ensure_ascii=False).encode()
     except FileNotFoundError:
@@ -52,3 +52,7 @@ def read_json(path: Path, what: str = "valid JSON") -> Any:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not {what}: {error}") from None
     return data
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"{name} is no number of JSON")

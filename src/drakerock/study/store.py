@@ -32,7 +32,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 import drakerock
 from drakerock.config import calc_config_hash
@@ -67,6 +67,8 @@ CREATE TABLE IF NOT EXISTS runs (
     executor TEXT NOT NULL, workers INTEGER NOT NULL, ending TEXT NOT NULL DEFAULT '');
 CREATE TABLE IF NOT EXISTS events (time REAL NOT NULL, kind TEXT NOT NULL, text TEXT NOT NULL);
 """
+# Checks the types of what an outcome.json holds.
+_OUTCOME = TypeAdapter(CycleOutcome)
 _KEPT_OF_OUTCOMES = ("outcome.json", "plan.json")
 
 
@@ -642,7 +644,12 @@ def read_outcome(path: Path) -> CycleOutcome:
     """
     data = read_json(path, "a readable outcome")
     try:
+        _OUTCOME.validate_python(data)
         return CycleOutcome(**data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{path}: not a readable outcome: {where}: {first['msg']}") from None
     except TypeError as error:
         raise InputError(f"{path}: not a readable outcome: {error}") from None
 
