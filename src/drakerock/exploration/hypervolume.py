@@ -28,13 +28,19 @@ def calc_hypervolume_share(F: Array, best: Array, reference: Array) -> float:
     Exact for up to five objectives, beyond that an estimate over fixed directions.
     """
     inside = F[(reference - F > 0.0).all(axis=1)] if len(F) else F
-    if not len(inside):
+    extent = reference - best
+    # A front that rounding makes flat has no box.
+    if not len(inside) or not (extent > 0.0).all():
         return 0.0
     k = len(reference)
+    with np.errstate(over="ignore", under="ignore"):
+        box = float(np.prod(extent))
+    if k <= MAX_EXACT and 1e-250 < box < 1e250:
+        return float(HV(ref_point=reference)(inside)) / box
+    gain = (reference - inside) / extent
     if k <= MAX_EXACT:
-        return float(HV(ref_point=reference)(inside)) / float(np.prod(reference - best))
+        return float(HV(ref_point=np.ones(k))(1.0 - gain))
     directions = make_directions(k, _N_DIRECTIONS, make_generator(0, "hypervolume", k))
-    gain = (reference - inside) / (reference - best)
     reached = measure_lengths(gain, directions).max(axis=0)
     return pi ** (k / 2) / (2**k * gamma(k / 2 + 1)) * float(np.mean(reached**k))
 

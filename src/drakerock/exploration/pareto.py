@@ -67,7 +67,7 @@ def parse_bound(text: str, problem: Problem) -> Bound:
         value = float(match[3]) if match else float("nan")
     except ValueError:
         match = None
-    if match is None:
+    if match is None or not np.isfinite(value):
         raise InputError(
             f"bound '{text}': expected objective<=number or objective>=number, such as debris<=500"
         )

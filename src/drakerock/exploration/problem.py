@@ -28,8 +28,8 @@ OWN_COLUMNS = (
 )  # fmt: skip
 # What is written beside an objective has its name and one of these.
 OBJECTIVE_SUFFIXES = ("_se", "_std", "_predicted", "_predicted_std", "_simulated", "_simulated_se", "_z")
-# Beyond it, squares and ranges overflow.
-MAX_MAGNITUDE = 1e100
+# Beyond it, hypervolumes of five objectives and squares overflow.
+MAX_MAGNITUDE = 1e60
 
 Magnitude = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
 

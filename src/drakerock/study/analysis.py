@@ -164,7 +164,11 @@ def _find_folder(source: Path) -> Path:
 
 
 def _load(source: Path) -> tuple[ResponseTable, ExplorationConfig, int]:
-    if (source / DATABASE).exists():
+    try:
+        stored = (source / DATABASE).exists()
+    except OSError as error:  # a name too long, a folder that may not be entered
+        raise InputError(f"{source}: cannot be read: {error.strerror}") from None
+    if stored:
         export_tables(source, ["parquet"])
     table = ResponseTable.load(source)
     path = _find_folder(source) / "study.json"

@@ -18,7 +18,7 @@ from drakerock.study.resimulation import Resimulation
 from drakerock.study.runner import run_study
 from drakerock.study.schema import StudyConfig
 
-NUMBERS = st.floats(-1e90, 1e90)
+NUMBERS = st.floats(-1e50, 1e50)
 
 
 def make(function, **fields):
@@ -26,7 +26,7 @@ def make(function, **fields):
 
 
 @given(
-    st.one_of(st.none(), st.floats(-1e90, 1e90), st.just(math.inf), st.just(-math.inf), st.just(math.nan)),
+    st.one_of(st.none(), st.floats(-1e50, 1e50), st.just(math.inf), st.just(-math.inf), st.just(math.nan)),
     NUMBERS,
 )
 def test_no_value_is_none_and_worst_bounds_all_others(value, worst):
@@ -53,7 +53,7 @@ def test_a_division_by_zero_is_the_worst_value():
         (lambda _: {}["mass"], "objective 'trial': KeyError: 'mass'"),
         (lambda _: "much", "objective 'trial': ValueError"),
         (lambda _: [1.0, 2.0], "objective 'trial': TypeError"),
-        (lambda _: 1e300, "objective 'trial': 1e.300; numbers up to 1e.100"),
+        (lambda _: 1e300, "objective 'trial': 1e.300; numbers up to 1e.60"),
     ],
 )
 def test_mistakes_are_told(function, message):
