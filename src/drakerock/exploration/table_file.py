@@ -264,7 +264,7 @@ def read_csv(path: Path, needed: Sequence[str]) -> TableFile:
         places.append(f"line {number}")
     file.places = places
     if comments:
-        notes.append(f"{comments} lines that begin with # are taken as comments")
+        notes.append("lines that begin with # are taken as comments")
     return file
 
 
