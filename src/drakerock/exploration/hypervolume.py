@@ -41,7 +41,9 @@ def calc_hypervolume_share(F: Array, best: Array, reference: Array) -> float:
     if k <= MAX_EXACT:
         return float(HV(ref_point=np.ones(k))(1.0 - gain))
     directions = make_directions(k, _N_DIRECTIONS, make_generator(0, "hypervolume", k))
-    reached = measure_lengths(gain, directions).max(axis=0)
+    # In parts that the processor's cache holds.
+    parts = np.split(directions, _N_DIRECTIONS // 128)
+    reached = np.concatenate([measure_lengths(gain, part).max(axis=0) for part in parts])
     return pi ** (k / 2) / (2**k * gamma(k / 2 + 1)) * float(np.mean(reached**k))
 
 
