@@ -335,7 +335,9 @@ def study_report(
     """
     from drakerock.study.analysis import run_report
 
-    _print_paths(run_report(source, out))
+    with _show_progress("report") as advance:
+        paths = run_report(source, out, advance)
+    _print_paths(paths)
 
 
 @study_app.command("confirm")
@@ -357,7 +359,8 @@ def study_confirm(
         console.print(Text(text), soft_wrap=True)
 
     again = Resimulation(folder, workers=workers, scheduler=scheduler, say=say)
-    confirmation = run_confirm(folder, again.evaluate, points, again.run)
+    with _show_progress("confirm") as advance:
+        confirmation = run_confirm(folder, again.evaluate, points, again.run, advance)
     if json_:
         print(json.dumps(confirmation.to_rows(), indent=2))
     else:
@@ -387,7 +390,8 @@ def strategy(
     if knee and weights is not None:
         raise InputError("--knee and --weights exclude each other")
     limits = [part for text in bound or [] for part in text.split(",") if part.strip()]
-    chosen = run_strategy(source, weights, limits)
+    with _show_progress("strategy") as advance:
+        chosen = run_strategy(source, weights, limits, advance)
     print(json.dumps(chosen.to_dict(), indent=2) if json_ else chosen.to_text())
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 from drakerock.errors import InputError
 
@@ -45,3 +47,27 @@ def write_text(path: Path, text: str) -> None:
         partial.replace(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def read_json(path: Path, what: str = "valid JSON") -> Any:
+    """Return what a JSON file holds; `what` it should be is said where it is not.
+
+    Raises:
+        InputError: it cannot be read, or is no JSON that can be written as UTF-8 again.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        data = json.loads(text, parse_constant=_refuse_constant)
+        # A lone half of a surrogate pair can be read by its escape, and written nowhere.
+        json.dumps(data, ensure_ascii=False).encode()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not {what}: {error}") from None
+    return data
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"{name} is no number of JSON")

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import struct
-import zlib
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,22 +55,16 @@ def load_arrays(path: str | Path, format_: str, version: int) -> tuple[dict[str,
                     f"{path}: {format_} {head['version']} is newer than this version reads ({version})"
                 )
             arrays = {name: data[name] for name in data.files if name != "header"}
+        header, checksum = dict(head["header"]), head["checksum"]
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        EOFError,
-        BadZipFile,
-        NotImplementedError,
-        zlib.error,
-        struct.error,
-    ) as error:
+    except InputError:
+        raise
+    except Exception as error:  # whatever numpy, zipfile, zlib and json make of a damaged file
         raise InputError(f"{path}: not a readable {format_} file: {error}") from None
-    if _calc_checksum(arrays) != head["checksum"]:
+    if _calc_checksum(arrays) != checksum:
         raise InputError(f"{path}: damaged: the checksum does not match")
-    return head["header"], arrays
+    return header, arrays
 
 
 def _calc_checksum(arrays: Arrays) -> str:

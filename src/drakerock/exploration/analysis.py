@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,9 @@ from drakerock.exploration.strategy import Strategy, choose_strategy
 from drakerock.exploration.surrogate import Surrogate, fit_surrogate
 from drakerock.exploration.table import ResponseTable
 from drakerock.exploration.validation import Accuracy, calc_learning_curve, validate
+
+Progress = Callable[[str, float | None], None]
+"""Called with what is being done and the share of it that is done, None where that is not known."""
 
 
 @dataclass(frozen=True)
@@ -56,17 +60,31 @@ def explore(
     config: ExplorationConfig | None = None,
     seed: int = 0,
     confirmation: Confirmation | None = None,
+    progress: Progress | None = None,
 ) -> Exploration:
     """Fit, validate, rank, search the front and choose; a function of the arguments only.
+
+    Args:
+        table: what to explore.
+        config: settings.
+        seed: seed of the study.
+        confirmation: of an earlier front, for the report.
+        progress: told what is being done, and which share of it is.
 
     Raises:
         InputError: too few points with responses, bounds that no point satisfies.
     """
     config = config or ExplorationConfig()
+    tell = progress or (lambda _stage, _share: None)
     problem = table.problem
+    tell("fitting", None)
     surrogate = fit_surrogate(table, config.surrogate, seed)
+    tell("validating", None)
     sizes, nrmse = calc_learning_curve(surrogate, table)
-    front = pareto_front(surrogate, config=config.pareto, seed=seed)
+    front = pareto_front(
+        surrogate, config=config.pareto, seed=seed, progress=lambda share: tell("searching the front", share)
+    )
+    tell("ranking variables", None)
     strategies = {"knee": choose_strategy(front)}
     if len(problem.objectives) > 1:
         strategies["equal weights"] = choose_strategy(front, dict.fromkeys(problem.objective_names, 1.0))

@@ -67,10 +67,11 @@ class Confirmation:
 
         def read(suffix: str) -> Array:
             data = [[row[f"{name}_{suffix}"] for name in problem.objective_names] for row in rows]
-            return np.array(data, dtype=float)
+            return np.array(data, dtype=float).reshape(len(rows), len(problem.objectives))
 
         try:
             X = np.array([[row[name] for name in problem.variable_names] for row in rows], dtype=float)
+            X = X.reshape(len(rows), len(problem.variables))
             failure = tuple(str(row["failure"]) for row in rows)
             return cls(
                 problem,
@@ -81,7 +82,7 @@ class Confirmation:
                 read("simulated_se"),
                 failure,
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(
                 f"confirmation: not the rows of a confirmation of this problem: {error}"
             ) from None

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 # Fewer values than this say nothing about rho; it is then taken as zero.
 MIN_LENGTH = 5
@@ -54,6 +54,14 @@ def calc_autocorrelation(sequences: Iterable[ArrayLike]) -> float:
     rho = lagged / total
     corrected = (n_mean * rho + 1.0) / (n_mean - 3.0) if n_mean > 4 else rho
     return float(np.clip(corrected, *_RHO_RANGE))
+
+
+def calc_means(Y: ArrayLike) -> NDArray[np.float64]:
+    """Return the mean of each column of Y (n, k), NaN left out; NaN for a column of NaN only."""
+    Y = np.asarray(Y, dtype=float)
+    good = np.isfinite(Y)
+    with np.errstate(invalid="ignore"):
+        return np.where(good, Y, 0.0).sum(axis=0) / good.sum(axis=0)
 
 
 def calc_standard_error(sequence: ArrayLike, autocorrelation: float | None = None) -> float:

@@ -1,5 +1,8 @@
 """The Pareto front on the surrogate (method section 6): NSGA-II, hypervolume, constraints, uncertainty.
 
+With five objectives and more nearly every point is non-dominated, and NSGA-II finds little but the ends of the front;
+the search then goes on with NSGA-III (Deb & Jain 2014), which keeps the best point along each of many directions.
+
 Plain dominance on a surrogate is misled by its smallest errors: a point whose production is predicted a
 millionth higher would stand on the front however much worse the rest is. The front is therefore the set of
 properly efficient points (Geoffrion 1968) with bounded trade-off: a gain must not cost more than M times as
@@ -11,26 +14,29 @@ gains less than 2 % of one range at the cost of all of another: about what a sur
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pymoo.algorithms.moo.nsga2 import NSGA2
+from pymoo.algorithms.moo.nsga3 import NSGA3
 from pymoo.core.callback import Callback
 from pymoo.core.problem import Problem as PymooProblem
-from pymoo.indicators.hv import HV
 from pymoo.optimize import minimize
 from pymoo.util.nds.non_dominated_sorting import NonDominatedSorting
 from scipy.spatial.distance import cdist
 
 from drakerock.errors import InputError
 from drakerock.exploration.config import Bound, ParetoConfig
+from drakerock.exploration.hypervolume import calc_hypervolume_share, make_directions
 from drakerock.exploration.problem import Array, Problem
 from drakerock.randomness import derive_seed, make_generator
 
 Indices = NDArray[np.int_]
+# From so many objectives on, three quarters of the search are NSGA-III.
+MANY_OBJECTIVES = 5
 
 
 def parse_bound(text: str, problem: Problem) -> Bound:
@@ -44,7 +50,7 @@ def parse_bound(text: str, problem: Problem) -> Bound:
         value = float(match[3]) if match else float("nan")
     except ValueError:
         match = None
-    if match is None:
+    if match is None or not np.isfinite(value):
         raise InputError(
             f"bound '{text}': expected objective<=number or objective>=number, such as debris<=500"
         )
@@ -116,15 +122,20 @@ class ParetoFront:
 
 
 def pareto_front(
-    surrogate: Model, bounds: Sequence[Bound] = (), config: ParetoConfig | None = None, seed: int = 0
+    surrogate: Model,
+    bounds: Sequence[Bound] = (),
+    config: ParetoConfig | None = None,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
 ) -> ParetoFront:
-    """Search the Pareto front of a surrogate inside the variables' ranges by NSGA-II.
+    """Search the Pareto front of a surrogate inside the variables' ranges by NSGA-II, or NSGA-III.
 
     Args:
         surrogate: a fitted `Surrogate`, or any `Model`.
         bounds: limits on objectives, in addition to those of the configuration.
         config: population, evaluations, draws.
         seed: seed of the study.
+        progress: called with the share of the search that is done.
 
     Raises:
         InputError: no point satisfies the bounds; the message says what can be reached.
@@ -137,18 +148,12 @@ def pareto_front(
         problem.get_objective(bound.objective)
     cone = _make_cone(surrogate, problem, config.max_trade_off, seed)
     search = _Search(surrogate, problem, limits, cone)
-    history = _History()
-    result = minimize(
-        search,
-        NSGA2(pop_size=config.population),
-        ("n_eval", config.evaluations),
-        seed=derive_seed(seed, "nsga2") % 2**32,
-        callback=history,
-    )
-    if result.X is None:
-        raise InputError(_describe_infeasible(surrogate, problem, limits, result))
-    U = np.atleast_2d(result.X)
-    X = problem.unscale(U)
+    history = _History(config.evaluations, progress)
+    results = _run_search(search, config, seed, history)
+    found = [np.atleast_2d(result.X) for result in results if result.X is not None]
+    if not found:
+        raise InputError(_describe_infeasible(surrogate, problem, limits, results[-1]))
+    X = problem.unscale(np.vstack(found))
     Y, std = surrogate.predict(X, return_std=True)
     keep = calc_non_dominated(Y @ cone.T)
     keep = keep[np.argsort((Y * signs)[keep, 0], kind="stable")]
@@ -156,10 +161,9 @@ def pareto_front(
     best, worst = (Y * signs).min(axis=0), (Y * signs).max(axis=0)
     spread = np.where(worst > best, worst - best, 1.0)
     reference = worst + 0.1 * spread
-    box = float(np.prod(reference - best))
     # Back from the cone's coordinates to minimised objectives.
     inverse = np.linalg.inv(cone).T * signs
-    volumes = [_calc_hypervolume(C @ inverse, reference) / box for C in history.fronts]
+    volumes = [calc_hypervolume_share(C @ inverse, best, reference) for C in history.fronts]
     front = ParetoFront(
         problem,
         X,
@@ -222,31 +226,61 @@ class _Search(PymooProblem):  # type: ignore[misc]
             out["G"] = np.column_stack([bound.calc_violation(self._problem, Y) for bound in self._bounds])
 
 
+def _run_search(search: _Search, config: ParetoConfig, seed: int, history: _History) -> list[Any]:
+    """Return pymoo's results; the optima of all of them together are candidates for the front."""
+    k, many = search.n_obj, search.n_obj >= MANY_OBJECTIVES
+    evaluations = config.evaluations // 4 if many else config.evaluations
+    pymoo_seed = derive_seed(seed, "nsga2") % 2**32
+    algorithm = NSGA2(pop_size=config.population)
+    first = minimize(search, algorithm, ("n_eval", evaluations), seed=pymoo_seed, callback=history)
+    if not many:
+        return [first]
+    # The axes, then directions between them; Sobol' points are balanced in powers of two.
+    n = max(config.population - k, 1)
+    between = make_directions(k, 2 ** int(np.ceil(np.log2(n))), make_generator(seed, "front directions"))[:n]
+    directions = np.vstack([np.eye(k), between / between.sum(axis=1, keepdims=True)])
+    algorithm = NSGA3(directions, pop_size=max(config.population, n + k), sampling=first.pop.get("X"))
+    history.begin_phase()
+    left = ("n_eval", config.evaluations - evaluations)
+    second = minimize(search, algorithm, left, seed=pymoo_seed, callback=history)
+    # NSGA-III counts the nearest point to each direction as its optimum; the rest of its population is as good.
+    if second.X is not None:
+        second.X = _get_feasible(second.pop).get("X")
+    return [first, second]
+
+
+def _get_feasible(population: Any) -> Any:
+    return population[population.get("feasible").ravel().astype(bool)]
+
+
 class _History(Callback):  # type: ignore[misc]
     """Per generation: number of evaluations, the non-dominated objectives, and some of the population."""
 
-    def __init__(self) -> None:
+    def __init__(self, total: int, progress: Callable[[float], None] | None) -> None:
         super().__init__()
+        self._total, self._progress = total, progress
+        self._before = 0
         self.evaluations: list[int] = []
         self.fronts: list[Array] = []
         self._populations: list[Array] = []
 
+    def begin_phase(self) -> None:
+        """Begin another search that counts its evaluations from zero."""
+        self._before = self.evaluations[-1]
+
     def update(self, algorithm: Any) -> None:
-        self.evaluations.append(int(algorithm.evaluator.n_eval))
-        optimum = algorithm.opt
-        feasible = optimum.get("feasible").ravel().astype(bool)
-        self.fronts.append(optimum.get("F")[feasible])
-        self._populations.append(algorithm.pop.get("X")[algorithm.pop.get("feasible").ravel().astype(bool)])
+        self.evaluations.append(self._before + int(algorithm.evaluator.n_eval))
+        if self._progress:
+            self._progress(min(self.evaluations[-1] / self._total, 1.0))
+        population = _get_feasible(algorithm.pop)
+        optimum = population if isinstance(algorithm, NSGA3) else _get_feasible(algorithm.opt)
+        self.fronts.append(optimum.get("F"))
+        self._populations.append(population.get("X"))
 
     def sample_pool(self, rng: np.random.Generator) -> Array:
         """Return points tried on the way (at most 700): what might have been optimal instead."""
         pool = np.unique(np.vstack(self._populations), axis=0)
         return pool[rng.permutation(len(pool))[:700]]
-
-
-def _calc_hypervolume(F: Array, reference: Array) -> float:
-    inside = F[(reference - F > 0.0).all(axis=1)] if len(F) else F
-    return float(HV(ref_point=reference)(inside)) if len(inside) else 0.0
 
 
 def _make_cone(surrogate: Model, problem: Problem, max_trade_off: float | None, seed: int) -> Array:
@@ -265,15 +299,14 @@ def _add_uncertainty(
     signs = front.problem.signs
     candidates = np.vstack([front.X, pool])
     draws = surrogate.draw(candidates, n_draws, make_generator(seed, "front draws"))
-    reference = front.reference * signs
-    box = float(np.prod(reference - front.ideal * signs))
+    ideal, reference = front.ideal * signs, front.reference * signs
     counts = np.zeros(len(front))
     volumes, fronts = [], []
     for Y in draws:
         # A bound is a statement about the prediction: the candidates satisfy it, their draws need not.
         best = calc_non_dominated(Y @ cone.T)
         counts[best[best < len(front)]] += 1
-        volumes.append(_calc_hypervolume(Y[best] * signs, reference) / box)
+        volumes.append(calc_hypervolume_share(Y[best] * signs, ideal, reference))
         fronts.append(Y[best])
     uncertainty = FrontUncertainty(counts / n_draws, np.array(volumes), tuple(fronts))
     return replace(front, uncertainty=uncertainty)

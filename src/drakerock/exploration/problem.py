@@ -17,16 +17,29 @@ from drakerock.config import Config
 from drakerock.errors import InputError
 
 Array = NDArray[np.float64]
-# A name is also a column of the table and part of a command-line option.
-Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+# A name is also a column of the table, part of a command-line option and of a figure's file name.
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=100)]
+# Columns of the tables that a study and the exploration write: of points, of loadings, of the front.
+OWN_COLUMNS = (
+    "point", "role", "loading", "n_loadings", "n_failed", "failure", "replay", "attempt", "status", "reason",
+    "p_optimal", "bucket_mass_kg", "bucket_rocks", "weighed_mass_kg", "loading_time_s", "energy_J",
+    "peak_push_force_N", "mean_push_force_N", "sim_time_s", "steps", "seed", "scenario_hash", "wall_time_s",
+    "rocks_total", "rocks_awake_mean", "rocks_awake_max", "seconds", "inputs_hash",
+)  # fmt: skip
+# What is written beside an objective has its name and one of these.
+OBJECTIVE_SUFFIXES = ("_se", "_std", "_predicted", "_predicted_std", "_simulated", "_simulated_se", "_z")
+# Beyond it, hypervolumes of five objectives and squares overflow.
+MAX_MAGNITUDE = 1e60
+
+Magnitude = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
 
 
 class Variable(Config):
     """One design variable and its range."""
 
     name: Name
-    low: float
-    high: float
+    low: Magnitude
+    high: Magnitude
     unit: str = "-"
     symbol: str = ""
     meaning: str = ""
@@ -52,6 +65,12 @@ class Objective(Config):
     sense: Literal["min", "max"] = "min"
     unit: str = "-"
     meaning: str = ""
+    worst: Annotated[
+        Magnitude | None,
+        Field(
+            description="value of a loading that has no finite one, such as energy per mass of nothing; a bound"
+        ),
+    ] = None
 
     @property
     def sign(self) -> float:
@@ -95,6 +114,18 @@ class Problem(Config):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"variable and objective names must differ; used twice: {', '.join(twice)}")
+        beside = {name + suffix: name for name in self.objective_names for suffix in OBJECTIVE_SUFFIXES}
+        own = {name.casefold() for name in OWN_COLUMNS}
+        for name in names:
+            if name.casefold() in own:
+                raise ValueError(
+                    f"no variable or objective may be called '{name}', a column of the tables; taken are "
+                    + ", ".join(OWN_COLUMNS)
+                )
+            if name in beside:
+                raise ValueError(
+                    f"no variable or objective may be called '{name}', a column that belongs to '{beside[name]}'"
+                )
         return self
 
     @property

@@ -26,6 +26,7 @@ from scipy.stats import qmc
 
 from drakerock.errors import InputError
 from drakerock.exploration.config import ParetoConfig, SamplingConfig
+from drakerock.exploration.hypervolume import make_directions, measure_lengths
 from drakerock.exploration.pareto import calc_non_dominated, pareto_front
 from drakerock.exploration.problem import Array, Problem
 from drakerock.exploration.surrogate import Kriging, Surrogate, calc_correlation, calc_ranges
@@ -270,10 +271,9 @@ class _VarianceUpdate:
 class HypervolumeSampler(Sampler):
     """Where the Pareto front may grow: expected improvement of the dominated hypervolume.
 
-    For any number of objectives the hypervolume is the mean over directions of a scalarisation (Deng & Zhang
-    2019), HV = c_k E[ max_i min_j ((r_j - f_ij)+ / v_j)^k ] with v uniform on the positive unit sphere; the
-    improvement by a draw from the surrogate at a candidate follows with the same directions. Within a batch
-    the predicted mean of each point taken counts as its response (Kriging believer).
+    The hypervolume is a mean over directions (see `hypervolume`); the improvement by a draw from the surrogate at
+    a candidate follows with the same directions. Within a batch the predicted mean of each point taken counts as
+    its response (Kriging believer).
     """
 
     n_directions = 256
@@ -299,7 +299,7 @@ class HypervolumeSampler(Sampler):
         f, s = mean * signs / ranges, std / ranges
         # 10 % of the range beyond the worst response, so that the ends of the front count too.
         reference = (Y[good] * signs / ranges).max(axis=0) + 0.1
-        directions = _make_directions(k, self.n_directions, rng)
+        directions = make_directions(k, self.n_directions, rng)
         normal = qmc.MultivariateNormalQMC(np.zeros(k), rng=rng).random(self.n_draws)
         lengths = np.array(
             [_scalarize(reference - f - s * z, directions) for z in normal]
@@ -391,18 +391,9 @@ def _sobol(d: int, n: int, rng: np.random.Generator) -> Array:
     return qmc.Sobol(d, rng=rng).random_base2(int(np.ceil(np.log2(n))))[:n]
 
 
-def _make_directions(k: int, n: int, rng: np.random.Generator) -> Array:
-    """Return unit vectors (n, k) uniform on the positive part of the sphere."""
-    z = np.abs(qmc.MultivariateNormalQMC(np.zeros(k), rng=rng).random(n))
-    return np.maximum(z / np.linalg.norm(z, axis=1, keepdims=True), 1e-9)
-
-
 def _scalarize(gain: Array, directions: Array) -> Array:
     """Return min_j ((gain_j)+ / v_j)^k, (n, n_directions), for gains (n, k) over the reference point."""
-    length = np.full((len(gain), len(directions)), np.inf)
-    for j in range(gain.shape[1]):
-        np.minimum(length, np.maximum(gain[:, j, None], 0.0) / directions[:, j], out=length)
-    return length ** gain.shape[1]
+    return measure_lengths(gain, directions) ** gain.shape[1]
 
 
 def _make_uniform(d: int) -> ot.Distribution:

@@ -70,6 +70,8 @@ def parse_weights(text: str, problem: Problem) -> dict[str, float]:
     weights: dict[str, float] = {}
     for part in text.split(","):
         name, sep, value = part.partition("=")
+        if name.strip() in weights:
+            raise InputError(f"weights '{text}': '{name.strip()}' has two")
         try:
             weights[name.strip()] = float(value)
         except ValueError:

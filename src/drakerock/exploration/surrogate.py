@@ -163,7 +163,8 @@ class Kriging(RegressorMixin, BaseEstimator):
         self.noise_ = np.zeros(n) if noise is None else np.asarray(noise, dtype=float)
         if self.noise_.shape != (n,) or not np.all(self.noise_ >= 0.0):
             raise ValueError(f"noise must be {n} standard errors >= 0")
-        self.constant_ = scale <= 1e-12 * float(np.abs(y).max())
+        # Also where squares would vanish.
+        self.constant_ = scale <= max(1e-12 * float(np.abs(y).max()), 1e-100)
         if self.constant_:
             self.theta_ = np.full(d, THETA_BOUNDS[0]) if self.theta is None else np.asarray(self.theta, float)
             self.lam_, self.sigma2_, self.log_likelihood_ = float(self.lam or 0.0), 0.0, float("nan")

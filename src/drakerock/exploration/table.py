@@ -20,7 +20,7 @@ standard errors that know about the autocorrelation along a sequence (`noise.py`
 from __future__ import annotations
 
 import difflib
-import json
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -34,10 +34,18 @@ from pydantic import ValidationError
 
 from drakerock.errors import InputError
 from drakerock.exploration.noise import calc_autocorrelation, calc_standard_error
-from drakerock.exploration.problem import Array, Problem
+from drakerock.exploration.problem import MAX_MAGNITUDE, Array, Problem
+from drakerock.exploration.table_file import TableFile, read_csv, read_parquet
+from drakerock.files import read_json
 
 ROLES = ("sample", "validation")
+# What else people call them; an empty cell is a sample.
+_ROLE_WORDS = dict.fromkeys(("", "sample", "samples", "train", "training", "fit"), "sample") | dict.fromkeys(
+    ("validation", "validate", "valid", "val", "test", "testing", "holdout"), "validation"
+)
+_OPTIONAL = ("point", "role", "loading", "n_loadings", "n_failed", "failure", "replay", "status")
 _METADATA_KEY = b"drakerock"
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -112,9 +120,12 @@ class ResponseTable:
                 raise InputError(
                     f"response table, point '{self.point[i]}': role '{role}' is not one of {', '.join(ROLES)}"
                 )
-        if np.isinf(self.Y).any() or np.nanmin(self.noise, initial=0.0) < 0.0:
+        if np.nanmin(self.noise, initial=0.0) < 0.0 or any(
+            np.nanmax(np.abs(values), initial=0.0) > MAX_MAGNITUDE for values in (self.Y, self.noise)
+        ):
             raise InputError(
-                "response table: responses must be finite or empty, standard errors >= 0 or empty"
+                f"response table: responses must be finite (up to {MAX_MAGNITUDE:g}) or empty, standard errors >= 0 "
+                "or empty"
             )
 
     def __len__(self) -> int:
@@ -162,20 +173,20 @@ class ResponseTable:
         """Read a table from a file, or from a study folder with `responses.parquet` or `responses.csv`.
 
         The problem is taken from, in this order: the argument, the file itself (Parquet), `study.json` beside
-        it (key `problem`), the default `Problem`.
+        it (key `problem`), the default `Problem`. What is taken for something else than it looks (other separators,
+        decimal commas, names spelled otherwise) is logged as a warning.
 
         Raises:
-            InputError: no such file, missing columns, values that are no numbers or out of range.
+            InputError: no such file, damaged, missing columns, columns that may be two things, values that are no
+                numbers or out of range.
         """
-        path = _find_table(Path(path))
         try:
-            read = pyarrow.parquet.read_table if path.suffix == ".parquet" else pyarrow.csv.read_csv
-            arrow = read(path)
-        except (pa.ArrowException, OSError) as error:
-            raise InputError(f"{path}: cannot be read as a table: {error}") from None
-        provenance = _read_provenance(path.parent / "study.json")
-        problem = problem or _find_problem(path, arrow, provenance)
-        return _from_arrow(cls, arrow, problem, provenance, str(path))
+            path = _find_table(Path(path))
+            provenance = _read_provenance(path.parent / "study.json")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        file, problem = _read_file(path, problem, provenance)
+        return _from_file(cls, file, problem, provenance)
 
 
 def _find_table(path: Path) -> Path:
@@ -189,7 +200,7 @@ def _find_table(path: Path) -> Path:
         )
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
-    if path.suffix not in (".csv", ".parquet"):
+    if path.suffix.lower() not in (".csv", ".tsv", ".txt", ".parquet"):
         raise InputError(f"{path}: a response table is a .csv or .parquet file")
     return path
 
@@ -197,17 +208,13 @@ def _find_table(path: Path) -> Path:
 def _read_provenance(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not valid JSON: {error}") from None
+    data = read_json(path)
     if not isinstance(data, dict):
         raise InputError(f"{path}: expected a JSON object")
     return data
 
 
-def _find_problem(path: Path, arrow: pa.Table, provenance: Mapping[str, Any]) -> Problem:
-    stored = (arrow.schema.metadata or {}).get(_METADATA_KEY)
+def _find_problem(path: Path, stored: bytes | None, provenance: Mapping[str, Any]) -> Problem:
     try:
         if stored is not None:
             return Problem.model_validate_json(stored)
@@ -221,66 +228,114 @@ def _find_problem(path: Path, arrow: pa.Table, provenance: Mapping[str, Any]) ->
     return Problem()
 
 
-def _from_arrow(
-    cls: type[Any], arrow: pa.Table, problem: Problem, provenance: Mapping[str, Any], source: str
-) -> Any:
-    names = arrow.column_names
-    for name in (*problem.variable_names, *problem.objective_names):
-        if name not in names:
-            near = difflib.get_close_matches(name, names, n=1)
-            hint = f" (did you mean '{near[0]}'?)" if near else ""
-            raise InputError(
-                f"{source}: no column '{name}'{hint}; needed are {', '.join(problem.variable_names)} and "
-                f"{', '.join(problem.objective_names)}. Other names and ranges: key 'problem' of study.json"
-            )
-    n = arrow.num_rows
+def _read_file(path: Path, given: Problem | None, provenance: Mapping[str, Any]) -> tuple[TableFile, Problem]:
+    if path.suffix.lower() == ".parquet":
+        file = read_parquet(path)
+        problem = given or _find_problem(path, file.metadata.get(_METADATA_KEY), provenance)
+    else:
+        problem = given or _find_problem(path, None, provenance)
+        file = read_csv(path, [*problem.variable_names, *problem.objective_names])
+    return file, problem
 
-    def numbers(name: str) -> Array:
-        try:
-            column = arrow.column(name).cast(pa.float64())
-        except pa.ArrowInvalid as error:
-            raise InputError(f"{source}: column '{name}' has a value that is no number: {error}") from None
-        return np.array([np.nan if v is None else v for v in column.to_pylist()], dtype=float)
 
-    def texts(name: str, default: Sequence[str]) -> tuple[str, ...]:
-        if name not in names:
-            return tuple(default)
-        return tuple("" if v is None else str(v) for v in arrow.column(name).to_pylist())
+def _from_file(cls: type[Any], file: TableFile, problem: Problem, provenance: Mapping[str, Any]) -> Any:
+    _find_columns(file, problem)
+    n = len(file)
 
-    def counts(name: str, default: int) -> tuple[int, ...]:
-        if name not in names:
-            return (default,) * n
-        return tuple(default if np.isnan(v) else int(v) for v in numbers(name))
+    def texts(name: str, default: str) -> tuple[str, ...]:
+        return tuple(file.get_texts(name)) if name in file else (default,) * n
 
-    X = np.column_stack([numbers(name) for name in problem.variable_names])
-    Y = np.column_stack([numbers(name) for name in problem.objective_names])
-    point = texts("point", [str(i) for i in range(n)])
-    role = tuple(r or "sample" for r in texts("role", ["sample"] * n))
-    failure, replay = texts("failure", [""] * n), texts("replay", [""] * n)
+    X = np.column_stack([file.get_numbers(name) for name in problem.variable_names])
+    Y = np.column_stack([file.get_numbers(name) for name in problem.objective_names])
+    point = texts("point", "") if "point" in file else tuple(str(i) for i in range(n))
+    point, role = tuple(name.strip() for name in point), _read_roles(file, texts("role", "sample"))
+    failure, replay = texts("failure", ""), texts("replay", "")
+    loading = _read_counts(file, "loading", None)
+    n_loadings, n_failed = _read_counts(file, "n_loadings", 1), _read_counts(file, "n_failed", 0)
+    noise = _read_noise(file, problem)
+    if "loading" not in file:
+        _check_points(file, point)
     try:
-        if "loading" in names:
-            return average_loadings(
-                problem, point, numbers("loading"), X, Y, role, failure, replay, provenance
+        if "loading" in file:
+            status = (
+                texts("status", "") if "status" in file else tuple("failed" * bool(text) for text in failure)
             )
-        unknown = np.full(n, np.nan)
-        noise = np.column_stack(
-            [numbers(f"{name}_se") if f"{name}_se" in names else unknown for name in problem.objective_names]
-        )
-        return cls(
-            problem,
-            X,
-            Y,
-            noise,
-            point,
-            role,
-            counts("n_loadings", 1),
-            counts("n_failed", 0),
-            failure,
-            replay,
-            provenance,
-        )
+            failed = [s == "failed" or bool(np.isnan(y).all()) for s, y in zip(status, Y, strict=True)]
+            table = average_loadings(problem, point, loading, X, Y, role, failure, replay, failed, provenance)
+        else:
+            table = cls(problem, X, Y, noise, point, role, n_loadings, n_failed, failure, replay, provenance)
     except InputError as error:
-        raise InputError(f"{source}: {error}") from None
+        raise InputError(f"{file.source}: {error}") from None
+    if file.notes:
+        _log.warning("%s: %s", file.source, "; ".join(file.notes))
+    return table
+
+
+def _find_columns(file: TableFile, problem: Problem) -> None:
+    """Find the problem's columns, whatever the file calls them, and how their numbers are written."""
+    needed = [*problem.variable_names, *problem.objective_names]
+    file.find_columns(needed)
+    for name in needed:
+        if name not in file:
+            near = difflib.get_close_matches(name, file.headers, n=1)
+            hint = f" (did you mean '{near[0]}'?)" if near else ""
+            found = ", ".join(f"'{header[:40]}'" for header in file.headers[:30])
+            raise InputError(
+                f"{file.source}: no column '{name}'{hint}; needed are {', '.join(problem.variable_names)} and "
+                f"{', '.join(problem.objective_names)}; found are {found or 'none'}. Other names and ranges: key "
+                "'problem' of study.json"
+            )
+    errors = [f"{name}_se" for name in problem.objective_names]
+    file.find_columns([*errors, *_OPTIONAL])
+    units = {v.name: v.unit for v in problem.variables} | {o.name: o.unit for o in problem.objectives}
+    for name, unit in units.items():
+        file.check_unit(name, file.get_header_unit(name), unit)
+    file.drop_units_row(units)
+    file.find_decimal_comma([*needed, *errors])
+
+
+def _read_noise(file: TableFile, problem: Problem) -> Array:
+    names = [f"{name}_se" for name in problem.objective_names]
+    unknown = np.full(len(file), np.nan)
+    return np.column_stack([file.get_numbers(name) if name in file else unknown for name in names])
+
+
+def _read_roles(file: TableFile, texts: Sequence[str]) -> tuple[str, ...]:
+    roles = tuple(_ROLE_WORDS.get(text.strip().casefold(), text) for text in texts)
+    taken = {
+        text.strip(): role for text, role in zip(texts, roles, strict=True) if text.strip() not in ("", role)
+    }
+    file.notes.extend(f"role '{text}' is taken as {role}" for text, role in taken.items() if role in ROLES)
+    return roles
+
+
+def _read_counts(file: TableFile, name: str, default: int | None) -> tuple[int, ...]:
+    """Return a column of whole numbers; InputError for others, and for empty cells without a default.
+
+    Where there is no such column, the default stands in all rows; without a default, nothing is returned.
+    """
+    if name not in file:
+        return () if default is None else (default,) * len(file)
+    result = []
+    for value, place in zip(file.get_numbers(name), file.places, strict=True):
+        if np.isnan(value) and default is not None:
+            result.append(default)
+        elif 0 <= value < 2**53 and value == int(value):
+            result.append(int(value))
+        else:
+            raise InputError(f"{file.source}: {place}: {name} is {value:g}; needed is a whole number >= 0")
+    return tuple(result)
+
+
+def _check_points(file: TableFile, point: Sequence[str]) -> None:
+    places: dict[str, str] = {}
+    for name, place in zip(point, file.places, strict=True):
+        if name in places:
+            raise InputError(
+                f"{file.source}: point '{name}' has two rows ({places[name]} and {place}); a table of single loadings "
+                "has a column 'loading'"
+            )
+        places[name] = place
 
 
 def average_loadings(
@@ -292,6 +347,7 @@ def average_loadings(
     role: Sequence[str] = (),
     failure: Sequence[str] = (),
     replay: Sequence[str] = (),
+    failed: Sequence[bool] = (),
     provenance: Mapping[str, Any] | None = None,
 ) -> ResponseTable:
     """Return the table of points from one row per loading.
@@ -301,21 +357,35 @@ def average_loadings(
         point: (m,) identifier of each loading's point.
         loading: (m,) number of the loading within its sequence.
         X: (m, d) the point, the same in all rows of one identifier.
-        Y: (m, k) responses of each loading, NaN where it failed.
+        Y: (m, k) responses of each loading, NaN where it failed or where an objective has no value.
         role, failure, replay: (m,) as in `ResponseTable`; the first entry that is not empty counts.
+        failed: (m,) which loadings failed; left out: those without any response.
         provenance: passed on.
 
-    The standard errors use one autocorrelation per objective, pooled over all sequences.
+    A loading without a value of an objective is left out of that objective's mean, and has not failed for that. The
+    standard errors use one autocorrelation per objective, pooled over all sequences.
+
+    Raises:
+        InputError: a point with two variables' values or roles, or with a loading twice.
     """
     m = len(point)
+    lost = np.array(failed, dtype=bool) if len(failed) else np.isnan(Y).all(axis=1)
     role, failure, replay = role or ("sample",) * m, failure or ("",) * m, replay or ("",) * m
     rows: dict[str, list[int]] = {}
     for i in np.argsort(np.asarray(loading, dtype=float), kind="stable"):
         rows.setdefault(point[int(i)], []).append(int(i))
     order = list(dict.fromkeys(point))
     for name in order:
+        if np.isnan(X[rows[name]]).any():
+            raise InputError(f"point '{name}' has a loading without the value of a variable")
         if np.ptp(X[rows[name]], axis=0).any() or len({role[i] for i in rows[name]}) > 1:
             raise InputError(f"point '{name}' has loadings with different design variables or roles")
+        numbers = [loading[i] for i in rows[name]]
+        if len(set(numbers)) < len(numbers):
+            twice = next(number for number in numbers if numbers.count(number) > 1)
+            raise InputError(
+                f"point '{name}' has the loading {twice:g} twice; keep one attempt of each point"
+            )
     mean = np.full((len(order), Y.shape[1]), np.nan)
     noise = np.full_like(mean, np.nan)
     for j in range(Y.shape[1]):
@@ -337,7 +407,7 @@ def average_loadings(
         tuple(order),
         first(role),
         tuple(len(rows[name]) for name in order),
-        tuple(int(np.isnan(Y[rows[name]]).any(axis=1).sum()) for name in order),
+        tuple(int(lost[rows[name]].sum()) for name in order),
         first(failure),
         first(replay),
         provenance or {},

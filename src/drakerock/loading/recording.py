@@ -182,21 +182,71 @@ def save_recording(recording: Recording, path: str | Path) -> None:
 def load_recording(path: str | Path) -> Recording:
     """Read a recording; InputError if it is missing, foreign, damaged or newer."""
     header, data = load_arrays(path, FORMAT, VERSION)
-    visuals = tuple(
-        Visual(body, *(data[f"visual_{k}_{name}"] for name in ("vertices", "triangles", "rgba")))
-        for k, body in enumerate(header["visual_bodies"])
+    try:
+        visuals = tuple(
+            Visual(body, *(data[f"visual_{k}_{name}"] for name in ("vertices", "triangles", "rgba")))
+            for k, body in enumerate(header["visual_bodies"])
+        )
+        shapes = tuple(
+            (data[f"shape_{k}_vertices"], data[f"shape_{k}_triangles"]) for k in range(header["n_shapes"])
+        )
+        recording = Recording(
+            bodies=tuple(header["bodies"]),
+            visuals=visuals,
+            rock_shapes=shapes,
+            site=SiteConfig(**header["site"]),
+            notes=dict(header["notes"]),
+            **{name: data[name] for name in _ARRAYS},
+        )
+        _check_recording(recording)
+    except KeyError as error:
+        raise InputError(f"{path}: not a readable recording: {error} is missing") from None
+    except (ValueError, TypeError) as error:
+        message = " ".join(str(error).split())
+        raise InputError(f"{path}: not a readable recording: {message}") from None
+    return recording
+
+
+def _check_recording(recording: Recording) -> None:
+    """Raise a ValueError if arrays do not fit each other, or indices point at nothing."""
+    f, b, n, m = (
+        len(recording.times),
+        len(recording.bodies),
+        len(recording.rock_size),
+        len(recording.move_rock),
     )
-    shapes = tuple(
-        (data[f"shape_{k}_vertices"], data[f"shape_{k}_triangles"]) for k in range(header["n_shapes"])
-    )
-    return Recording(
-        bodies=tuple(header["bodies"]),
-        visuals=visuals,
-        rock_shapes=shapes,
-        site=SiteConfig(**header["site"]),
-        notes=header["notes"],
-        **{name: data[name] for name in _ARRAYS},
-    )
+    expected = {
+        "times": (f,), "modes": (f,), "X_WBs": (f, b, 7), "rock_shape": (n,), "rock_size": (n,), "rock_fixed": (n,),
+        "X_WRs": (n, 7), "move_frame": (m,), "move_rock": (m,), "move_pose": (m, 7),
+    }  # fmt: skip
+    if not f or not all(isinstance(name, str) for name in recording.bodies):
+        raise ValueError("no frames, or bodies without names")
+    for name, form in expected.items():
+        _check_array(name, getattr(recording, name), form)
+    indices = {"rock_shape": len(recording.rock_shapes), "move_frame": f, "move_rock": n}
+    for name, end in indices.items():
+        _check_indices(name, getattr(recording, name), end)
+    meshes: list[tuple[NDArray[Any], NDArray[Any]]] = list(recording.rock_shapes)
+    meshes += [(visual.vertices, visual.triangles) for visual in recording.visuals]
+    for vertices, triangles in meshes:
+        _check_array("vertices", vertices, (len(vertices), 3))
+        _check_array("triangles", triangles, (len(triangles), 3))
+        _check_indices("triangles", triangles, len(vertices))
+    for visual in recording.visuals:
+        _check_array("rgba", visual.rgba, (4,))
+        _check_indices("visual_bodies", np.asarray(visual.body), b)
+
+
+def _check_array(name: str, array: NDArray[Any], form: tuple[int, ...]) -> None:
+    if array.shape != form:
+        raise ValueError(f"{name}: shape {array.shape} instead of {form}")
+    if array.dtype.kind not in "fiub" or not np.isfinite(array).all():
+        raise ValueError(f"{name}: holds {array.dtype} or numbers that are not finite")
+
+
+def _check_indices(name: str, array: NDArray[Any], end: int) -> None:
+    if array.dtype.kind not in "iu" or ((array < 0) | (array >= end)).any():
+        raise ValueError(f"{name}: an index beyond {end - 1}")
 
 
 _ARRAYS = (

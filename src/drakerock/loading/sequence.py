@@ -78,7 +78,7 @@ def _read_loading(place: Path, identity: str) -> tuple[CycleOutcome, PileState] 
         return None
     try:
         outcome = CycleOutcome.from_json(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, TypeError):
+    except (OSError, ValueError, TypeError, RecursionError):
         raise InputError(
             f"{path}: not a readable outcome; remove {place} to run this loading again"
         ) from None

@@ -35,10 +35,15 @@ def load_signals(path: str | Path) -> tuple[dict[str, Array], dict[str, str]]:
         InputError: missing or not a file of signals.
     """
     try:
-        table = pq.read_table(path)
+        with pq.ParquetFile(path) as file:
+            table = file.read()
+        table.validate(full=True)
         units = {field.name: field.metadata[b"unit"].decode() for field in table.schema}
+        columns = {
+            name: np.asarray(table[name].cast(pa.float64()), dtype=float) for name in table.column_names
+        }
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (OSError, pa.ArrowException, KeyError, TypeError) as error:
+    except Exception as error:  # whatever pyarrow makes of a damaged or foreign file
         raise InputError(f"{path}: not a readable file of signals: {error}") from None
-    return {name: table[name].to_numpy() for name in table.column_names}, units
+    return columns, units

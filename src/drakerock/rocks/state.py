@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drakerock.errors import InputError
 from drakerock.npz import load_arrays, save_arrays
 
 Array = NDArray[np.float64]
@@ -133,8 +134,7 @@ class PileState:
             array = getattr(self, name)
             if array.shape != form:
                 raise ValueError(f"{name}: shape {array.shape} instead of {form}")
-            if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise ValueError(f"{name}: not finite")
+            _check_numbers(name, array)
         if self.contacts is not None:
             _check_contacts(self.contacts, n)
 
@@ -170,6 +170,18 @@ _ARRAYS = ("p_WRs", "q_WRs", "V_WRs", "shape", "size", "fixed")
 _CONTACT_ARRAYS = ("pairs", "points", "impulses", "resting")
 
 
+# Kinds of numbers (numpy's letters) that the arrays may hold; floats unless said otherwise.
+_KINDS = {"shape": "iu", "pairs": "iu", "fixed": "b", "resting": "b"}
+
+
+def _check_numbers(name: str, array: NDArray[Any]) -> None:
+    kinds = _KINDS.get(name.rpartition(".")[2], "fiu")
+    if array.dtype.kind not in kinds:
+        raise ValueError(f"{name}: holds {array.dtype}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"{name}: not finite")
+
+
 def _check_contacts(contacts: ContactMemory, n: int) -> None:
     c = len(contacts.pairs)
     expected = {"pairs": (c, 2), "points": (c, 3), "impulses": (c, 3), "resting": (n,)}
@@ -177,8 +189,7 @@ def _check_contacts(contacts: ContactMemory, n: int) -> None:
         array = getattr(contacts, name)
         if array.shape != form:
             raise ValueError(f"contacts.{name}: shape {array.shape} instead of {form}")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise ValueError(f"contacts.{name}: not finite")
+        _check_numbers(f"contacts.{name}", array)
     if c and not ((contacts.pairs[:, 0] >= 0).all() and (contacts.pairs < n).all()):
         raise ValueError("contacts.pairs: a rock that is not in the pile")
 
@@ -205,9 +216,21 @@ def load_pile(path: str | Path) -> PileState:
         InputError: missing, foreign, damaged, or of a newer version.
     """
     header, arrays = load_arrays(path, FORMAT, VERSION)
-    contacts = None
-    if "contact_pairs" in arrays:
-        contacts = ContactMemory(**{name: arrays[f"contact_{name}"] for name in _CONTACT_ARRAYS})
-    return PileState(
-        **{name: arrays[name] for name in _ARRAYS}, provenance=header["provenance"], contacts=contacts
-    )
+    try:
+        contacts = None
+        if "contact_pairs" in arrays:
+            contacts = ContactMemory(**{name: arrays[f"contact_{name}"] for name in _CONTACT_ARRAYS})
+        pile = PileState(
+            **{name: arrays[name] for name in _ARRAYS},
+            provenance=dict(header["provenance"]),
+            contacts=contacts,
+        )
+        if (np.abs(np.linalg.norm(pile.q_WRs, axis=1) - 1.0) > 1e-3).any():
+            raise ValueError("q_WRs: not unit quaternions")
+        if (pile.size <= 0.0).any() or (pile.shape < 0).any():
+            raise ValueError("size and shape: sizes must be > 0, shapes >= 0")
+    except KeyError as error:
+        raise InputError(f"{path}: not a readable pile: {error} is missing") from None
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path}: not a readable pile: {error}") from None
+    return pile

@@ -16,27 +16,30 @@ from typing import Any
 from pydantic import ValidationError
 
 from drakerock.errors import InputError
-from drakerock.exploration.analysis import explore
-from drakerock.exploration.config import ExplorationConfig
+from drakerock.exploration.analysis import Progress, explore
+from drakerock.exploration.config import Bound, ExplorationConfig
 from drakerock.exploration.confirmation import Confirmation, Evaluate, confirm_points
-from drakerock.exploration.pareto import pareto_front, parse_bound, select_spread
+from drakerock.exploration.pareto import ParetoFront, pareto_front, parse_bound, select_spread
 from drakerock.exploration.problem import Array, Problem, format_number
 from drakerock.exploration.strategy import Strategy, choose_strategy, parse_weights
-from drakerock.exploration.surrogate import fit_surrogate
+from drakerock.exploration.surrogate import Surrogate, fit_surrogate
 from drakerock.exploration.table import ResponseTable
-from drakerock.files import write_text
+from drakerock.files import read_json, write_text
 from drakerock.study.db import DATABASE
 from drakerock.study.tables import export_tables
 
 _CONFIRMATION = "confirmation.json"
 
 
-def run_report(source: str | Path, out: str | Path | None = None) -> list[Path]:
+def run_report(
+    source: str | Path, out: str | Path | None = None, progress: Progress | None = None
+) -> list[Path]:
     """Write the report of a study or table; returns the written paths, report.html first.
 
     Args:
         source: study folder or table file.
         out: folder to write into; None: `report` in the study folder, or beside the table.
+        progress: told what is being done.
 
     Raises:
         InputError: see `ResponseTable.load` and `explore`.
@@ -50,13 +53,17 @@ def run_report(source: str | Path, out: str | Path | None = None) -> list[Path]:
     confirmation = _read_confirmation(folder / _CONFIRMATION, table.problem)
     name = table.provenance.get("name")
     title = f"Exploration of {name}" if name else f"Exploration of {source.resolve().name}"
-    return write_report(
-        explore(table, config, seed, confirmation), Path(out) if out else folder / "report", title
-    )
+    exploration = explore(table, config, seed, confirmation, progress)
+    if progress:
+        progress("drawing", None)
+    return write_report(exploration, Path(out) if out else folder / "report", title)
 
 
 def run_strategy(
-    source: str | Path, weights: Mapping[str, float] | str | None = None, bounds: Sequence[str] = ()
+    source: str | Path,
+    weights: Mapping[str, float] | str | None = None,
+    bounds: Sequence[str] = (),
+    progress: Progress | None = None,
 ) -> Strategy:
     """Return the Pareto-optimal strategy of a study or table for a trade-off.
 
@@ -64,6 +71,7 @@ def run_strategy(
         source: study folder or table file.
         weights: by objective, as a mapping or as text (``production=0.6,damage=0.4``); None: the knee point.
         bounds: limits such as ``debris<=500``. The front is searched within them.
+        progress: told what is being done.
 
     Raises:
         InputError: see `parse_weights`, `parse_bound`, `pareto_front` and `choose_strategy`.
@@ -72,8 +80,8 @@ def run_strategy(
     if isinstance(weights, str):
         weights = parse_weights(weights, table.problem)
     limits = [parse_bound(text, table.problem) for text in bounds]
-    surrogate = fit_surrogate(table, config.surrogate, seed)
-    return choose_strategy(pareto_front(surrogate, limits, config.pareto, seed), weights, limits)
+    front = _search_front(table, config, seed, limits, progress)[1]
+    return choose_strategy(front, weights, limits)
 
 
 def run_confirm(
@@ -81,6 +89,7 @@ def run_confirm(
     evaluate: Evaluate,
     n: int | None = None,
     prepare: Callable[[Array], None] | None = None,
+    progress: Progress | None = None,
 ) -> Confirmation:
     """Simulate points of the front again and store predicted against simulated in `confirmation.json`.
 
@@ -90,6 +99,7 @@ def run_confirm(
         n: how many points: the knee, the best of each objective, then points spread between them. None: the
             settings' `n_confirm`.
         prepare: called with all points (n, d) before the first is evaluated, to simulate them at once.
+        progress: told what is being done until then.
 
     Raises:
         InputError: see `ResponseTable.load` and `explore`; n below one.
@@ -97,9 +107,10 @@ def run_confirm(
     if n is not None and n < 1:
         raise InputError(f"confirm: asked for {n} points; ask for at least one")
     table, config, seed = _load(Path(source))
-    surrogate = fit_surrogate(table, config.surrogate, seed)
-    front = pareto_front(surrogate, config=config.pareto, seed=seed)
+    surrogate, front = _search_front(table, config, seed, progress=progress)
     chosen = select_spread(front, n or config.n_confirm, [choose_strategy(front).index])
+    if progress:
+        progress("simulating", None)
     if prepare:
         prepare(front.X[chosen])
     confirmation = confirm_points(surrogate, front.X[chosen], evaluate)
@@ -134,12 +145,32 @@ def _join(value: float, spread: float) -> str:
     return f"{format_number(value, 4)} +- {format_number(spread, 2)}"
 
 
+def _search_front(
+    table: ResponseTable,
+    config: ExplorationConfig,
+    seed: int,
+    bounds: Sequence[Bound] = (),
+    progress: Progress | None = None,
+) -> tuple[Surrogate, ParetoFront]:
+    tell = progress or (lambda _stage, _share: None)
+    tell("fitting", None)
+    surrogate = fit_surrogate(table, config.surrogate, seed)
+    front = pareto_front(
+        surrogate, bounds, config.pareto, seed, lambda share: tell("searching the front", share)
+    )
+    return surrogate, front
+
+
 def _find_folder(source: Path) -> Path:
     return source if source.is_dir() else source.parent
 
 
 def _load(source: Path) -> tuple[ResponseTable, ExplorationConfig, int]:
-    if (source / DATABASE).exists():
+    try:
+        stored = (source / DATABASE).exists()
+    except OSError as error:  # a name too long, a folder that may not be entered
+        raise InputError(f"{source}: cannot be read: {error.strerror}") from None
+    if stored:
         export_tables(source, ["parquet"])
     table = ResponseTable.load(source)
     path = _find_folder(source) / "study.json"
@@ -159,9 +190,9 @@ def _read_confirmation(path: Path, problem: Problem) -> Confirmation | None:
     if not path.exists():
         return None
     try:
-        rows: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
+        rows: list[dict[str, Any]] = read_json(path)
         return Confirmation.from_rows(problem, rows)
-    except (ValueError, InputError) as error:
+    except InputError as error:
         raise InputError(
             f"{path}: {error}; make it again with `drakerock study confirm`, or remove it"
         ) from None

@@ -28,11 +28,11 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.problem import Array
-from drakerock.files import make_folder, write_text
+from drakerock.files import make_folder, read_json, write_text
 from drakerock.identity import RESULTS_REVISION, calc_config_hash, describe_content, get_versions
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario
@@ -60,6 +60,8 @@ CREATE TABLE IF NOT EXISTS runs (
     executor TEXT NOT NULL, workers INTEGER NOT NULL, ending TEXT NOT NULL DEFAULT '');
 CREATE TABLE IF NOT EXISTS events (time REAL NOT NULL, kind TEXT NOT NULL, text TEXT NOT NULL);
 """
+# Checks the types of what an outcome.json holds.
+_OUTCOME = TypeAdapter(CycleOutcome)
 _KEPT_OF_OUTCOMES = ("outcome.json", "plan.json")
 
 
@@ -369,11 +371,10 @@ def read_study(folder: str | Path) -> StudyConfig:
         InputError: no study there, or one that cannot be read.
     """
     path = Path(folder) / STUDY
+    data = read_json(path, "a readable study")
     try:
-        return StudyConfig.model_validate(json.loads(path.read_text(encoding="utf-8"))["study"])
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, ValueError, KeyError, TypeError, ValidationError) as error:
+        return StudyConfig.model_validate(data["study"])
+    except (KeyError, TypeError, ValidationError) as error:
         raise InputError(f"{path}: not a readable study: {str(error).splitlines()[0]}") from None
 
 
@@ -383,9 +384,15 @@ def read_outcome(path: Path) -> CycleOutcome:
     Raises:
         InputError: it cannot be read.
     """
+    data = read_json(path, "a readable outcome")
     try:
-        return CycleOutcome.from_json(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, TypeError) as error:
+        _OUTCOME.validate_python(data)
+        return CycleOutcome(**data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{path}: not a readable outcome: {where}: {first['msg']}") from None
+    except TypeError as error:
         raise InputError(f"{path}: not a readable outcome: {error}") from None
 
 

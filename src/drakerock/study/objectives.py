@@ -5,16 +5,21 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from drakerock.errors import InputError
-from drakerock.exploration.problem import Objective
+from drakerock.exploration.problem import MAX_MAGNITUDE, Objective
 from drakerock.loading.outcome import CycleOutcome
 
 ObjectiveFunction = Callable[[CycleOutcome], float | None]
-"""From the outcome of a finished cycle to the objective in its natural sense; None: no value."""
+"""From the outcome of a finished cycle to the objective in its natural sense.
+
+None (or NaN): no value, the loading is left out of this objective's mean. An infinite number, or a division by zero:
+the objective's `worst`, and no value where none is registered. A finite value beyond `worst` counts as `worst`.
+"""
 
 
 @dataclass(frozen=True)
@@ -23,6 +28,34 @@ class RegisteredObjective:
 
     objective: Objective
     function: ObjectiveFunction
+
+    def evaluate(self, outcome: CycleOutcome) -> float:
+        """Return the objective of a cycle that has not failed, finite; NaN: no value.
+
+        Raises:
+            InputError: the function raised something else than a division by zero, or returned no number.
+        """
+        objective = self.objective
+        try:
+            result = self.function(outcome)
+            value = math.nan if result is None else float(result)
+        except ZeroDivisionError:
+            value = math.inf
+        except Exception as error:  # whatever a user's function dies of
+            raise InputError(f"objective '{objective.name}': {type(error).__name__}: {error}") from error
+        if math.isnan(value):
+            return value
+        if objective.worst is None:
+            if math.isfinite(value) and abs(value) > MAX_MAGNITUDE:
+                raise InputError(
+                    f"objective '{objective.name}': {value:g}; numbers up to {MAX_MAGNITUDE:g} are taken, or an "
+                    "infinite one for the worst value"
+                )
+            return value if math.isfinite(value) else math.nan
+        if math.isinf(value):
+            return objective.worst
+        # Worst is the largest value of what is minimised, the smallest of what is maximised.
+        return objective.sign * min(objective.sign * value, objective.sign * objective.worst)
 
 
 _REGISTRY: dict[str, RegisteredObjective] = {}
@@ -97,11 +130,12 @@ def _get_debris(outcome: CycleOutcome) -> float | None:
 
 
 @register_objective(
-    Objective(name="specific_energy", unit="J/kg", meaning="the motors' work over the loaded mass")
+    # A full bucket takes some 300 J/kg; a megajoule for a rock of 100 kg is as bad as nothing.
+    Objective(name="specific_energy", unit="J/kg", meaning="the motors' work over the loaded mass", worst=1e4)
 )
 def _calc_specific_energy(outcome: CycleOutcome) -> float | None:
-    if outcome.energy_J is None or not outcome.bucket_mass_kg:
-        return None  # an empty bucket has no finite value
+    if outcome.energy_J is None or outcome.bucket_mass_kg is None:
+        return None
     return outcome.energy_J / outcome.bucket_mass_kg
 
 

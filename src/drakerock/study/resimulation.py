@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from drakerock.errors import InputError, RunStopped
-from drakerock.exploration.noise import calc_autocorrelation, calc_standard_error
+from drakerock.exploration.noise import calc_autocorrelation, calc_means, calc_standard_error
 from drakerock.exploration.problem import Array
 from drakerock.files import make_folder
 from drakerock.identity import get_versions
@@ -53,10 +53,10 @@ class Resimulation:
         self._folder = Path(folder)
         with Store.open(self._folder) as store:
             self._study, loadings = store.study, read_loadings(store)
-        self._functions = [get_objective(name) for name in self._study.objectives]
+        self._objectives = [get_objective(name) for name in self._study.objectives]
         # A single sequence knows its autocorrelation badly: that of the study's own sequences is taken.
         self._rho = []
-        for item in self._functions:
+        for item in self._objectives:
             sequences: dict[tuple[str, int], list[float]] = {}
             for row in loadings.select(["point", "attempt", item.objective.name]).to_pylist():
                 value = row[item.objective.name]
@@ -100,6 +100,8 @@ class Resimulation:
     def evaluate(self, x: Array) -> tuple[Array, Array]:
         """Return mean responses and standard errors (k,) at a point (d,), simulated here if `run` has not.
 
+        NaN stands for an objective without a value in any loading.
+
         Raises:
             RuntimeError: the simulation failed.
         """
@@ -113,15 +115,18 @@ class Resimulation:
         outcomes = [read_outcome(path) for path in sorted(task.folder.glob("loading_*/outcome.json"))]
         Y = np.array(
             [
-                [np.nan if outcome.status == "failed" else item.function(outcome) for item in self._functions]
+                [
+                    np.nan if outcome.status == "failed" else item.evaluate(outcome)
+                    for item in self._objectives
+                ]
                 for outcome in outcomes
             ],
             dtype=float,
         )
-        if np.isnan(Y).all():
+        if all(outcome.status == "failed" for outcome in outcomes):
             raise RuntimeError(next(outcome.reason for outcome in outcomes))
         errors = [calc_standard_error(y, rho) for y, rho in zip(Y.T, self._rho, strict=True)]
-        return np.nanmean(Y, axis=0), np.array(errors)
+        return calc_means(Y), np.array(errors)
 
     def _make_task(self, x: Array) -> Task:
         scenario = self._study.make_scenario(x, "confirmation", 0)

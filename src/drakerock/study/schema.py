@@ -176,6 +176,8 @@ class StudyConfig(Config):
             for module in self.modules:
                 import_module(module)
             problem = self.problem
+        except ValidationError as error:
+            raise ValueError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
         except InputError as error:
             raise ValueError(str(error)) from None
         # The ends of every range must be scenarios; what lies between is then taken to be one.

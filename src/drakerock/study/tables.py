@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -30,13 +29,14 @@ def read_responses(store: Store, role: str | None = None) -> ResponseTable:
         InputError: an objective's function failed.
     """
     problem = store.study.problem
-    functions = [get_objective(name) for name in store.study.objectives]
+    objectives = [get_objective(name) for name in store.study.objectives]
     names: list[str] = []
     loadings: list[float] = []
     X: list[Array] = []
     Y: list[list[float]] = []
     roles: list[str] = []
     failures: list[str] = []
+    failed: list[bool] = []
     rows: dict[tuple[str, int], list[tuple[int, str, str, str]]] = {}
     for point, attempt, *rest in store.db.execute(
         "SELECT point, attempt, loading, status, reason, outcome FROM cycles ORDER BY loading"
@@ -53,10 +53,11 @@ def read_responses(store: Store, role: str | None = None) -> ResponseTable:
             loadings.append(loading)
             X.append(point.x)
             Y.append(
-                [np.nan] * len(functions)
+                [np.nan] * len(objectives)
                 if lost
-                else [_evaluate(item.function, item.objective.name, outcome) for item in functions]
+                else [item.evaluate(CycleOutcome.from_json(outcome)) for item in objectives]
             )
+            failed.append(lost)
             roles.append(point.role)
             failures.append(reasons[point.name] if point.status == "failed" else reason)
     if not names:
@@ -64,14 +65,21 @@ def read_responses(store: Store, role: str | None = None) -> ResponseTable:
         return ResponseTable(problem, np.empty((0, d)), np.empty((0, k)))
     provenance = json.loads((store.folder / STUDY).read_text(encoding="utf-8"))
     return average_loadings(
-        problem, names, loadings, np.array(X), np.array(Y), roles, failures, provenance=provenance
+        problem,
+        names,
+        loadings,
+        np.array(X),
+        np.array(Y),
+        roles,
+        failures,
+        failed=failed,
+        provenance=provenance,
     )
 
 
 def read_loadings(store: Store) -> pa.Table:
     """Return one row per recorded cycle, of all attempts: point, variables, objectives, outcome, cost."""
     problem, columns = store.study.problem, {}
-    functions = [get_objective(name) for name in store.study.objectives]
     points = {point.name: point for point in store.list_points()}
     rows = store.db.execute(
         "SELECT c.point, c.attempt, c.loading, c.status, c.reason, c.outcome, c.seconds, s.inputs_hash "
@@ -85,13 +93,11 @@ def read_loadings(store: Store) -> pa.Table:
         columns[name] = [row[j] for row in rows]
     for j, name in enumerate(problem.variable_names):
         columns[name] = [float(points[row[0]].x[j]) for row in rows]
-    for item in functions:
-        columns[item.objective.name] = [
-            None
-            if row[3] == "failed"
-            else _evaluate(item.function, item.objective.name, row[5], missing=None)
-            for row in rows
+    for item in [get_objective(name) for name in store.study.objectives]:
+        values = [
+            np.nan if row[3] == "failed" else item.evaluate(CycleOutcome.from_json(row[5])) for row in rows
         ]
+        columns[item.objective.name] = pa.array(values, pa.float64(), from_pandas=True)
     for name in ("bucket_mass_kg", "bucket_rocks", "weighed_mass_kg", "loading_time_s", "energy_J",
                  "peak_push_force_N", "mean_push_force_N", "sim_time_s", "steps", "seed",
                  "scenario_hash", "wall_time_s"):  # fmt: skip
@@ -130,11 +136,3 @@ def export_tables(folder: str | Path, formats: Sequence[str] = ("csv", "parquet"
                 raise InputError(f"{path}: cannot be written: {error}") from None
             paths.append(path)
     return paths
-
-
-def _evaluate(function: Any, name: str, outcome: str, missing: float | None = np.nan) -> Any:
-    try:
-        value = function(CycleOutcome.from_json(outcome))
-        return missing if value is None else float(value)
-    except Exception as error:  # whatever a user's function dies of
-        raise InputError(f"objective '{name}': {type(error).__name__}: {error}") from error

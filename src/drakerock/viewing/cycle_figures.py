@@ -6,7 +6,6 @@ folder and writes them all as PNG.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from drakerock.errors import InputError
+from drakerock.files import read_json
 from drakerock.loading.field import HeightField, PileProfile, calc_pile_profile
 from drakerock.loading.plan import DigPlan
 from drakerock.loading.plan_file import load_plan
@@ -73,8 +73,8 @@ def load_cycle(folder: str | Path) -> StoredCycle:
     plan, field = load_plan(folder / "plan.json")
     signals, _ = load_signals(folder / "signals.parquet")
     return StoredCycle(
-        _read_json(folder / "outcome.json"),
-        _read_json(folder / "scenario.json"),
+        _read_object(folder / "outcome.json"),
+        _read_object(folder / "scenario.json"),
         plan if isinstance(plan, DigPlan) else None,
         field,
         signals,
@@ -82,13 +82,11 @@ def load_cycle(folder: str | Path) -> StoredCycle:
     )
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not readable: {error}") from None
+def _read_object(path: Path) -> dict[str, Any]:
+    data = read_json(path)
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: expected a JSON object")
+    return data
 
 
 def draw_height_field(ax: Axes, field: HeightField, profile: PileProfile, plan: DigPlan | None) -> Axes:

@@ -17,6 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from drakerock.errors import InputError
 from drakerock.exploration.analysis import Exploration
 from drakerock.exploration.confirmation import Confirmation
 from drakerock.exploration.pareto import ParetoFront
@@ -24,12 +25,18 @@ from drakerock.exploration.problem import Array, Problem, Variable
 from drakerock.exploration.sensitivity import Sensitivity
 from drakerock.exploration.table import ResponseTable
 from drakerock.exploration.validation import Accuracy
+from drakerock.files import make_folder
 
 COLORMAP = "cividis"
 _DARK, _MIDDLE, _LIGHT = "#1b2a41", "#6c757d", "#c9ced3"
 _ACCENT = "#b5400b"
 # Projections drawn for a problem with many objectives or variables; beyond it pages get unreadable.
 _MAX_PANELS = 6
+
+
+def draw_literally(text: str) -> str:
+    """Return a user's text as matplotlib has to be given it: it would read what stands between dollars as formulas."""
+    return text.replace("$", r"\$")
 
 
 def draw_nested_contours(
@@ -52,12 +59,13 @@ def draw_nested_contours(
         n_outer, n_inner: cells per outer variable, grid points per inner variable and cell.
     """
     d, variables = len(problem.variables), problem.variables
-    label = problem.objectives[objective].label
+    label = draw_literally(problem.objectives[objective].label)
+    names = [draw_literally(variable.label) for variable in variables]
     t = np.linspace(0.0, 1.0, n_inner)
     if d == 1:
         x = problem.low + t[:, None] * (problem.high - problem.low)
         ax.plot(x[:, 0], predict(x)[:, objective], color=_DARK)
-        ax.set(xlabel=variables[0].label, ylabel=label)
+        ax.set(xlabel=names[0], ylabel=label)
         return ax
     columns = np.linspace(0.0, 1.0, n_outer) if d > 2 else np.array([0.5])
     rows = np.linspace(0.0, 1.0, n_outer) if d > 3 else np.array([0.5])
@@ -86,7 +94,7 @@ def draw_nested_contours(
     ax.set_ylim(-0.5, len(rows) - 0.5)
     if d == 2:
         _set_ticks(ax, variables[0], variables[1], size)
-        ax.set(xlabel=variables[0].label, ylabel=variables[1].label)
+        ax.set(xlabel=names[0], ylabel=names[1])
         return ax
     ax.set_xticks(range(len(columns)), [f"{variables[2].low + c * _span(variables[2]):.3g}" for c in columns])
     if d > 3:
@@ -94,10 +102,11 @@ def draw_nested_contours(
     else:
         ax.set_yticks([])
     inner = " and ".join(
-        f"{v.label} {v.low:g} to {v.high:g} {way}" for v, way in zip(variables[:2], "→↑", strict=True)
+        f"{name} {v.low:g} to {v.high:g} {way}"
+        for name, v, way in zip(names[:2], variables[:2], "→↑", strict=True)
     )
-    ax.set_xlabel(f"{variables[2].label}     (in each cell: {inner})")
-    ax.set_ylabel(variables[3].label if d > 3 else "", rotation=0, labelpad=10)
+    ax.set_xlabel(f"{names[2]}     (in each cell: {inner})")
+    ax.set_ylabel(names[3] if d > 3 else "", rotation=0, labelpad=10)
     return ax
 
 
@@ -120,7 +129,7 @@ def draw_front(
         marks: objectives (k,) to point out, by their label.
     """
     x, y = pair
-    objectives = front.problem.objectives
+    labels = [draw_literally(objective.label) for objective in front.problem.objectives]
     if simulated is not None:
         ax.scatter(
             simulated[:, x], simulated[:, y], s=10, marker="x", lw=0.6, color=_LIGHT, label="simulated"
@@ -136,13 +145,13 @@ def draw_front(
         front.Y[:, x], front.Y[:, y], s=16, edgecolors=_DARK, linewidths=0.3, label="front", **colour
     )
     if shade is not None:
-        ax.figure.colorbar(points, ax=ax, label=objectives[shade].label, orientation="horizontal", pad=0.03)
+        ax.figure.colorbar(points, ax=ax, label=labels[shade], orientation="horizontal", pad=0.03)
     for label, value in (marks or {}).items():
         ax.scatter(
             value[x], value[y], s=95, marker="D", facecolors="white", edgecolors=_ACCENT, linewidths=1.4
         )
         ax.annotate(
-            label,
+            draw_literally(label),
             (value[x], value[y]),
             fontsize=7,
             ha="center",
@@ -150,7 +159,7 @@ def draw_front(
             color=_ACCENT,
             weight="bold",
         )
-    ax.set(xlabel=objectives[x].label, ylabel=objectives[y].label)
+    ax.set(xlabel=labels[x], ylabel=labels[y])
     return ax
 
 
@@ -162,7 +171,7 @@ def draw_coverage(ax: Axes, table: ResponseTable, pair: tuple[int, int]) -> Axes
         colour = _DARK if role == "sample" else _ACCENT
         ax.scatter(X[:, i], X[:, j], s=size, marker=marker, color=colour, lw=0.9, label=role)
     a, b = table.problem.variables[i], table.problem.variables[j]
-    ax.set(xlabel=a.label, ylabel=b.label)
+    ax.set(xlabel=draw_literally(a.label), ylabel=draw_literally(b.label))
     ax.set_xlim(a.low - 0.04 * _span(a), a.high + 0.04 * _span(a))
     ax.set_ylim(b.low - 0.04 * _span(b), b.high + 0.04 * _span(b))
     return ax
@@ -186,6 +195,7 @@ def draw_predicted(ax: Axes, accuracy: Accuracy, label: str) -> Axes:
     if np.isfinite(accuracy.noise_floor):
         shown.append(f"noise floor {100 * accuracy.noise_floor:.1f} %")
     ax.text(0.04, 0.96, "\n".join(shown), transform=ax.transAxes, va="top", fontsize=7.5)
+    label = draw_literally(label)
     ax.set(xlabel=f"simulated {label}", ylabel=f"predicted {label}")
     ax.legend(loc="lower right", fontsize=7.5, frameon=False)
     return ax
@@ -213,7 +223,7 @@ def draw_sensitivity(ax: Axes, sensitivity: Sensitivity, labels: Sequence[str]) 
         label="total",
         **bars,
     )
-    ax.set_xticks(place, labels)
+    ax.set_xticks(place, [draw_literally(label) for label in labels])
     ax.set_ylim(0.0, max(1.0, 1.05 * float(np.max(sensitivity.total + sensitivity.total_half))))
     ax.set_ylabel("Sobol' index")
     ax.set_title(sensitivity.objective, fontsize=9)
@@ -258,7 +268,7 @@ def draw_confirmation(ax: Axes, confirmation: Confirmation, objective: int) -> A
     if len(x):
         ends = np.array([min(x.min(), y.min()), max(x.max(), y.max())])
         ax.plot(ends, ends, color=_MIDDLE, lw=0.8, zorder=0)
-    label = confirmation.problem.objectives[objective].label
+    label = draw_literally(confirmation.problem.objectives[objective].label)
     ax.set(xlabel=f"re-simulated {label}", ylabel=f"predicted {label}")
     return ax
 
@@ -325,14 +335,17 @@ def save_figures(
     figures: dict[str, Figure], folder: Path, formats: Sequence[str] = ("png", "pdf")
 ) -> list[Path]:
     """Write every figure in every format into `folder`, which is made if needed; returns the paths."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     paths = []
     for name, figure in figures.items():
         for suffix in formats:
             path = folder / f"{name}.{suffix}"
             # Dates and program versions would make equal figures differ.
             metadata = {"CreationDate": None} if suffix == "pdf" else {"Software": None}
-            figure.savefig(path, dpi=150, metadata=metadata)
+            try:
+                figure.savefig(path, dpi=150, metadata=metadata)
+            except OSError as error:
+                raise InputError(f"{path}: cannot be written: {error.strerror}") from None
             paths.append(path)
     return paths
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import base64
+import html
 import json
 from importlib.metadata import version
 from itertools import combinations
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import jinja2
 import numpy as np
@@ -65,6 +67,7 @@ def make_report(exploration: Exploration, images: dict[str, bytes], title: str) 
     )
     environment.filters["number"] = _format
     environment.filters["pm"] = _format_spread
+    environment.filters["link"] = _find_link
     failures = [i for i in range(len(table)) if table.n_failed[i] or table.failure[i]]
     return environment.get_template("report.html.jinja").render(
         title=title,
@@ -133,7 +136,7 @@ def _make_explorer(exploration: Exploration) -> str:
                         "y": plane.yaxis.domain[1] + 0.01,
                         "yanchor": "bottom",
                         "title": {
-                            "text": problem.objectives[shade].label,
+                            "text": html.escape(problem.objectives[shade].label),
                             "side": "top",
                             "font": {"size": 11},
                         },
@@ -164,7 +167,7 @@ def _make_explorer(exploration: Exploration) -> str:
         place = {"row": row + 1, "col": column + 1}
         # plotly pushes an axis title clear of tick labels only where they meet: an annotation stays put.
         figure.add_annotation(
-            text=problem.objectives[x].label,
+            text=html.escape(problem.objectives[x].label),
             xref="x domain",
             yref="y domain",
             x=0.5,
@@ -174,7 +177,7 @@ def _make_explorer(exploration: Exploration) -> str:
             font={"size": 14},
             **place,
         )
-        figure.update_yaxes(title_text=problem.objectives[y].label, title_standoff=4, **place)
+        figure.update_yaxes(title_text=html.escape(problem.objectives[y].label), title_standoff=4, **place)
     figure.update_layout(
         template="plotly_white",
         height=430 * rows,
@@ -184,13 +187,13 @@ def _make_explorer(exploration: Exploration) -> str:
         hovermode="closest",
     )
     buttons = [["zoom2d", "pan2d", "resetScale2d", "toImage"]]
-    html: str = figure.to_html(
+    page: str = figure.to_html(
         full_html=False,
         include_plotlyjs=False,
         div_id="explorer",
         config={"displaylogo": False, "responsive": True, "modeBarButtons": buttons},
     )
-    return html
+    return page
 
 
 def _list_points(exploration: Exploration) -> list[dict[str, Any]]:
@@ -207,7 +210,7 @@ def _list_points(exploration: Exploration) -> list[dict[str, Any]]:
             "y": [_significant(v) for v in y],
             "std": [_significant(v) for v in std],
             "p": p,
-            "replay": replay,
+            "replay": _find_link(replay),
         }
 
     points = []
@@ -264,6 +267,14 @@ def _caption(name: str) -> str:
 def _embed(data: Any) -> str:
     """Return JSON that can stand inside a script element whatever texts it holds."""
     return json.dumps(data, allow_nan=False).replace("<", "\\u003c")
+
+
+def _find_link(address: str) -> str:
+    """Return the address of a replay if a page may open it: a path, or one of the web; "" otherwise."""
+    try:
+        return address if urlsplit(address.strip()).scheme in ("", "http", "https", "file") else ""
+    except ValueError:
+        return ""
 
 
 def _significant(value: float) -> float | None:

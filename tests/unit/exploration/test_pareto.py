@@ -7,6 +7,7 @@ from scipy.spatial.distance import cdist
 
 from drakerock.errors import InputError
 from drakerock.exploration.config import Bound, ParetoConfig
+from drakerock.exploration.hypervolume import calc_hypervolume_share, make_directions
 from drakerock.exploration.pareto import (
     calc_non_dominated,
     pareto_front,
@@ -15,7 +16,7 @@ from drakerock.exploration.pareto import (
 )
 from drakerock.exploration.problem import Objective, Problem, Variable
 from drakerock.exploration.problems import make_dtlz2, make_noisy_loading, make_zdt
-from drakerock.exploration.sampling import _make_directions, _scalarize
+from drakerock.exploration.sampling import _scalarize
 from drakerock.exploration.surrogate import Surrogate
 
 QUICK = ParetoConfig(population=100, evaluations=8000, n_draws=0)
@@ -146,7 +147,7 @@ def test_scalarisation_is_the_hypervolume():
 
     for k in (1, 2, 3):
         F = np.random.default_rng(k).uniform(0, 1, (12, k))
-        directions = _make_directions(k, 2**15, np.random.default_rng(0))
+        directions = make_directions(k, 2**15, np.random.default_rng(0))
         mean = _scalarize(1.1 - F, directions).max(axis=0).mean()
         ball = pi ** (k / 2) / (2**k * gamma(k / 2 + 1))
         assert ball * mean == pytest.approx(float(HV(ref_point=np.full(k, 1.1))(F)), rel=0.01)
@@ -175,7 +176,7 @@ class TestBounds:
         bound = parse_bound(" debris <= 5e2", self.known.problem)
         assert (bound.objective, bound.relation, bound.value) == ("debris", "<=", 500.0)
         assert parse_bound("production>=-1.5", self.known.problem).value == -1.5
-        for text in ("debris<500", "debris<=", "debris<=many", "<=3", "debris<=-"):
+        for text in ("debris<500", "debris<=1e999", "debris<=", "debris<=many", "<=3", "debris<=-"):
             with pytest.raises(InputError, match="expected objective<=number"):
                 parse_bound(text, self.known.problem)
         with pytest.raises(
@@ -222,3 +223,61 @@ def test_spread_points_are_spread():
     subsets = [regret[rng.choice(len(front), 12, replace=False)] for _ in range(50)]
     assert gaps.min() > 2 * np.median([(cdist(r, r) + 9 * np.eye(12)).min() for r in subsets])
     assert len(select_spread(front, 10_000)) == len(front)
+
+
+def make_sphere(k):
+    """DTLZ2 with k objectives and k + 2 variables, in a surrogate's place."""
+    problem = Problem(
+        variables=tuple(Variable(name=f"x{i}", low=0, high=1) for i in range(k + 2)),
+        objectives=tuple(Objective(name=f"f{i}") for i in range(k)),
+    )
+
+    class Sphere:
+        problem_ = problem
+
+        def predict(self, X, return_std=False):
+            angles = np.asarray(X)[:, : k - 1] * np.pi / 2
+            radius = 1 + np.sum((np.asarray(X)[:, k - 1 :] - 0.5) ** 2, axis=1)
+            Y = np.tile(radius[:, None], (1, k))
+            Y[:, :-1] *= np.cumprod(np.cos(angles), axis=1)[:, ::-1]
+            Y[:, 1:] *= np.sin(angles)[:, ::-1]
+            return (Y, np.zeros_like(Y)) if return_std else Y
+
+    return Sphere()
+
+
+@pytest.mark.parametrize("k", [5, 8])
+def test_many_objectives_reach_the_front_and_its_ends(k):
+    config = ParetoConfig(population=200, evaluations=24_000, n_draws=0, max_trade_off=1000.0)
+    shares = []
+    front = pareto_front(make_sphere(k), config=config, progress=shares.append)
+    distance = np.abs(np.linalg.norm(front.Y, axis=1) - 1.0)
+    assert np.median(distance) < 0.05
+    assert len(front) > 150
+    assert front.ideal == pytest.approx(np.zeros(k), abs=0.05)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert list(front.evaluations) == sorted(front.evaluations)
+    assert front.evaluations[-1] == pytest.approx(24_000, rel=0.03)
+
+
+@pytest.mark.parametrize("k", [6, 7])
+def test_hypervolume_of_many_objectives_is_near_the_exact_one(k):
+    from pymoo.indicators.hv import HV
+
+    rng = np.random.default_rng(k)
+    F = np.abs(rng.standard_normal((40, k)))
+    F *= np.geomspace(1e-3, 1e3, k) / np.linalg.norm(F, axis=1)[:, None]
+    best, reference = F.min(axis=0), F.max(axis=0) + 0.1 * np.ptp(F, axis=0)
+    scaled = (F - best) / (reference - best)
+    exact = float(HV(ref_point=np.ones(k))(scaled))
+    assert calc_hypervolume_share(F, best, reference) == pytest.approx(exact, rel=0.02)
+    assert calc_hypervolume_share(F[:0], best, reference) == 0.0
+
+
+def test_bounds_hold_with_many_objectives():
+    sphere, config = make_sphere(6), ParetoConfig(population=60, evaluations=4000, n_draws=0)
+    front = pareto_front(sphere, [Bound(objective="f0", relation="<=", value=0.3)], config)
+    assert front.Y[:, 0].max() <= 0.3
+    with pytest.raises(InputError, match="no strategy satisfies f0>=3"):
+        pareto_front(sphere, [Bound(objective="f0", relation=">=", value=3.0)], config)

@@ -115,6 +115,10 @@ def test_errors_name_file_and_key(tmp_path, folder):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     with pytest.raises(InputError, match="unknown objective 'speed'"):
         run_strategy(tmp_path, "speed=1")
+    with pytest.raises(InputError, match="'damage' has two"):
+        run_strategy(tmp_path, "damage=1,damage=2")
+    with pytest.raises(InputError, match="cannot be read: File name too long"):
+        run_strategy("x" * 5000)
     with pytest.raises(InputError, match="no strategy satisfies production>=900"):
         run_strategy(folder, bounds=["production>=900"])
     (tmp_path / "study.json").write_text(json.dumps({"exploration": {"pareto": {"population": 1}}}))

@@ -104,6 +104,14 @@ def test_what_is_left_of_a_neutral_study_is_what_results_depend_on(write):
             {"objectives": ["prodction"]},
             ["study.yaml", "'prodction'", "did you mean 'production'?", "debris"],
         ),
+        (
+            {"variables": [{"name": "failure", "key": "loading.strategy.alpha", "low": 0.3, "high": 1}]},
+            ["study.yaml: no variable or objective may be called 'failure'", "point, role"],
+        ),
+        (
+            {"variables": [{"name": "damage_se", "key": "loading.strategy.alpha", "low": 0.3, "high": 1}]},
+            ["study.yaml: no variable or objective may be called 'damage_se'", "belongs to 'damage'"],
+        ),
         ({"modules": ["no.py"]}, ["study.yaml", "modules", "no.py", "cannot be imported"]),
         (
             {"variables": [{"name": "a", "key": "loading.strategy.alhpa", "low": 0.3, "high": 1}]},

@@ -7,6 +7,9 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from drakerock.exploration.analysis import explore
@@ -16,7 +19,13 @@ from drakerock.exploration.problem import Objective, Problem, Variable
 from drakerock.exploration.problems import make_noisy_loading, make_noisy_table
 from drakerock.exploration.strategy import choose_strategy
 from drakerock.exploration.table import ResponseTable
-from drakerock.viewing.exploration_figures import draw_front, draw_nested_contours, make_figures, save_figures
+from drakerock.viewing.exploration_figures import (
+    draw_front,
+    draw_literally,
+    draw_nested_contours,
+    make_figures,
+    save_figures,
+)
 from drakerock.viewing.report import make_report, write_report
 
 QUICK = ExplorationConfig(
@@ -239,3 +248,70 @@ def test_figures_leave_no_global_state(exploration):
     before = pyplot.get_fignums()
     make_figures(exploration)
     assert pyplot.get_fignums() == before
+
+
+def render(text, **options):
+    figure = Figure(figsize=(2, 0.4))
+    canvas = FigureCanvasAgg(figure)
+    figure.text(0.05, 0.4, text, **options)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.text("$\\{}_^%a b", max_size=12))
+def test_any_text_is_drawn_as_it_is(text):
+    assert np.array_equal(render(draw_literally(text)), render(text, parse_math=False))
+
+
+def test_units_and_symbols_are_drawn_and_written_as_they_are():
+    """Formulas, broken formulas and HTML in units and symbols are texts in the figures and on the page."""
+    odd = ["$_{$", "<b>kg</b>", r"\$x$^$", "$a$ & $b"]
+    problem = Problem(
+        variables=tuple(Variable(name=f"x{i}", symbol=odd[i], low=-1, high=1, unit=odd[i]) for i in range(4)),
+        objectives=tuple(Objective(name=f"f{i}", unit=odd[i], meaning=odd[i]) for i in range(3)),
+    )
+    X = np.random.default_rng(0).uniform(-1, 1, (40, 4))
+    Y = np.stack([((X - 0.5 * np.cos(i)) ** 2).sum(axis=1) for i in range(3)], axis=1)
+    links = ("javascript:alert(1)", "http://[", "replays/1.html") + ("",) * 37
+    table = ResponseTable(problem, X, Y, replay=links, role=("sample",) * 30 + ("validation",) * 10)
+    exploration = explore(table, QUICK)
+    exploration = replace(
+        exploration,
+        confirmation=confirm_points(
+            exploration.surrogate, exploration.front.X[:2], lambda x: (np.zeros(3), np.ones(3))
+        ),
+    )
+    figures = make_figures(exploration)
+    for figure in figures.values():
+        figure.draw_without_rendering()
+    assert figures["predicted"].axes[0].get_xlabel() == draw_literally("simulated f0 [$_{$]")
+    page = make_report(exploration, dict.fromkeys(figures, b""), "odd $_{$ <i>")
+    parsed = Links(page)
+    assert [link for link in parsed.links if not link.startswith(("data:", "#"))] == ["replays/1.html"]
+    text = " ".join(" ".join(parsed.text).split())
+    assert all(symbol in text for symbol in odd)
+    explorer = json.loads('"' + re.search(r'"text":"(f1 [^"]*)"', page)[1] + '"')
+    assert explorer == "f1 [&lt;b&gt;kg&lt;/b&gt;]", "plotly reads its texts as HTML"
+
+
+def test_eight_objectives_have_a_report():
+    problem = Problem(
+        variables=tuple(Variable(name=f"x{i}", low=-1, high=1) for i in range(3)),
+        objectives=tuple(Objective(name=f"f{i}") for i in range(8)),
+    )
+    X = np.random.default_rng(0).uniform(-1, 1, (30, 3))
+    Y = np.stack([((X - 0.5 * np.cos(i)) ** 2).sum(axis=1) for i in range(8)], axis=1)
+    stages = []
+    exploration = explore(
+        ResponseTable(problem, X, Y), QUICK, progress=lambda stage, share: stages.append(stage)
+    )
+    assert list(dict.fromkeys(stages)) == [
+        "fitting",
+        "validating",
+        "searching the front",
+        "ranking variables",
+    ]
+    names = ["pareto", "coverage", "predicted", "sensitivity", "convergence"]
+    images = dict.fromkeys([*names, *(f"contours_f{i}" for i in range(8))], b"")
+    assert "best f7" in make_report(exploration, images, "eight")
