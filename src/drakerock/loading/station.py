@@ -96,7 +96,7 @@ def make_station(scenario: Scenario, pile: PileState) -> Station:
         InputError: the machine's SDFormat file, a rock mesh or a stored plan cannot be used.
     """
     dynamics, loading = scenario.dynamics, scenario.loading
-    shapes = load_rock_shapes(scenario.rocks.shapes)
+    shapes = load_rock_shapes(scenario.rocks.shapes, scenario.rocks.max_corners)
     site = make_site(scenario.site)
 
     builder = DiagramBuilder()

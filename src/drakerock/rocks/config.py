@@ -12,6 +12,11 @@ from drakerock.config import Config
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 
+# Rocks that a pile may have.
+MAX_ROCKS = 100_000
+# Corners of a rock shape, unless said otherwise: the cost of a contact grows with them.
+MAX_CORNERS = 40
+
 
 class SizeClass(Config):
     """One class of the gradation: rocks of one sieve width and their share of the total mass."""
@@ -27,6 +32,9 @@ class RocksConfig(Config):
         tuple[str, ...],
         Field(min_length=1, description="mesh files (.obj), one per convex shape, at any scale"),
     ] = tuple(f"package://drakerock/rocks/rock_{k}.obj" for k in range(6))
+    max_corners: Annotated[
+        int, Field(ge=8, le=128, description="a shape with more corners is reduced to so many")
+    ] = MAX_CORNERS
     gradation: Annotated[tuple[SizeClass, ...], Field(min_length=1)] = (
         SizeClass(size_m=0.3, mass_fraction=0.2),
         SizeClass(size_m=0.4, mass_fraction=0.3),
@@ -104,7 +112,7 @@ class PileConfig(Config):
         int | None,
         Field(
             gt=0,
-            le=100_000,
+            le=MAX_ROCKS,
             description="number of moving rocks to emit; null: until the void is full to the emitter",
         ),
     ] = None

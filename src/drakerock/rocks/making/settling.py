@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,7 +20,7 @@ from drakerock.config import Config, calc_config_hash
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.randomness import make_generator
 from drakerock.resources import find_data
-from drakerock.rocks.config import PileConfig, RocksConfig, SiteConfig
+from drakerock.rocks.config import MAX_ROCKS, PileConfig, RocksConfig, SiteConfig
 from drakerock.rocks.contact_graph import find_loose
 from drakerock.rocks.drake.assembly import add_plant, add_site
 from drakerock.rocks.drake.plant_engine import add_plant_rocks, add_rock_bodies
@@ -44,6 +45,10 @@ Progress = Callable[[str, float], None]
 """Called with what is being done and its share done in [0, 1]."""
 
 
+_log = logging.getLogger(__name__)
+
+# Share of the room under the emitter that rocks fill.
+PACKING = 0.6
 # The void is full when its level has stayed at the emitter for so many batches: rocks still flow out.
 FULL_BATCHES = 4
 # So many batches without room for a single rock, and it is the others' turn.
@@ -202,10 +207,11 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
     for bit.
 
     Raises:
-        InputError: a rock finds no room in the emitter.
+        InputError: more rocks than the engine takes, or a rock finds no room in the emitter.
         SimulationFailure: the dynamics failed, or the pile did not come to rest in time.
     """
-    shapes = load_rock_shapes(recipe.rocks.shapes)
+    _announce_number(recipe)
+    shapes = load_rock_shapes(recipe.rocks.shapes, recipe.rocks.max_corners)
     rng = make_generator(recipe.seed, "pile")
     site, n = recipe.site, recipe.pile.rocks
     pile = make_empty_pile()
@@ -242,9 +248,25 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
     return replace(pile, provenance=provenance)
 
 
+def _announce_number(recipe: PileRecipe) -> None:
+    """Say how many rocks are about to be simulated; InputError if the gradation makes too many of them."""
+    rocks = recipe.rocks
+    volume = calc_mean_volume(rocks, load_rock_shapes(rocks.shapes, rocks.max_corners))
+    depth = recipe.site.rear_layer if recipe.pile.rocks else recipe.site.void_depth
+    room = PACKING * depth * recipe.site.drift_width * recipe.pile.emission_height
+    number = (recipe.pile.rocks or 0) + round(room / volume)
+    if number > MAX_ROCKS:
+        least = min(rocks.gradation, key=lambda item: item.size_m)
+        raise InputError(
+            f"rocks.gradation: it makes a pile of about {number} rocks, most of them of size_m {least.size_m:g}; at "
+            f"most {MAX_ROCKS} are allowed: leave the smallest out, or make size_m larger or the site smaller"
+        )
+    _log.warning("drakerock: making a pile of about %d rocks (once)", number)
+
+
 def _count_filling(recipe: PileRecipe, depth: float) -> int:
     """Return more rocks than fit under the emitter over a depth [m]: as if they filled it without gaps."""
-    shapes = load_rock_shapes(recipe.rocks.shapes)
+    shapes = load_rock_shapes(recipe.rocks.shapes, recipe.rocks.max_corners)
     room = depth * recipe.site.drift_width * (recipe.pile.emission_height + 1.0)
     return int(np.ceil(room / calc_mean_volume(recipe.rocks, shapes)))
 
