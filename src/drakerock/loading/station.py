@@ -167,7 +167,7 @@ def make_station(
     plant, scene_graph = add_plant(builder, dynamics)
     AddDrift(plant, site, dynamics.plant)
     machine = add_machine(plant, scenario.machine)
-    shapes = load_rock_shapes(scenario.rocks.shapes)
+    shapes = load_rock_shapes(scenario.rocks.shapes, scenario.rocks.max_corners)
     bodies = None
     if dynamics.rocks == "plant":
         bodies = AddRockBodies(

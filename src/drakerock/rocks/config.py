@@ -16,6 +16,10 @@ NonNegative = Annotated[float, Field(ge=0)]
 # Rocks leave the emitter as if they had fallen from 0.5 m above it, so that it clears in time [m/s].
 START_SPEED = 3.0
 GRAVITY = 9.81
+# Rocks that a pile may have.
+MAX_ROCKS = 100_000
+# Corners of a rock shape, unless said otherwise: the cost of a contact grows with them.
+MAX_CORNERS = 40
 
 
 class SizeClass(Config):
@@ -34,6 +38,9 @@ class RocksConfig(Config):
         tuple[str, ...],
         Field(min_length=1, description="mesh files (.obj), one per convex shape, at any scale"),
     ] = tuple(f"package://drakerock/rocks/rock_{k}.obj" for k in range(6))
+    max_corners: Annotated[
+        int, Field(ge=8, le=128, description="a shape with more corners is reduced to so many")
+    ] = MAX_CORNERS
     gradation: Annotated[tuple[SizeClass, ...], Field(min_length=1)] = (
         SizeClass(size_m=0.3, mass_fraction=0.2),
         SizeClass(size_m=0.4, mass_fraction=0.3),
@@ -113,7 +120,7 @@ class PileConfig(Config):
         int | None,
         Field(
             gt=0,
-            le=100_000,
+            le=MAX_ROCKS,
             description="number of moving rocks to emit; null: until the void is full to the emitter",
         ),
     ] = None

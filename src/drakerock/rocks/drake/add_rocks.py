@@ -98,7 +98,7 @@ def AddRocks(
         builder.Connect(plant.get_body_poses_output_port(), rocks.GetInputPort("body_poses"))
         return rocks
     settings = engine or NonsmoothConfig()
-    shapes = shapes or load_rock_shapes(config.shapes)
+    shapes = shapes or load_rock_shapes(config.shapes, config.max_corners)
     solver = NonsmoothEngine(
         config, shapes, geometry.surroundings, settings, plant.time_step(), pile.shape, pile.size, pile.fixed,
         geometry.pieces, len(geometry.bodies), plant.gravity_field().gravity_vector(),

@@ -82,7 +82,7 @@ def AddRockBodies(
     if plant.is_finalized():
         raise InputError("AddRockBodies: the plant is finalized; add rocks as bodies before Finalize()")
     rocks, config = rocks or RocksConfig(), config or PlantEngineConfig()
-    shapes = shapes or load_rock_shapes(rocks.shapes)
+    shapes = shapes or load_rock_shapes(rocks.shapes, rocks.max_corners)
     instance = plant.AddModelInstance("rocks")
     kinds = {
         (shape, size): _make_kind(shapes[shape], size, rocks, config, reference_overlap)

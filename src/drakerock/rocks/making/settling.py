@@ -19,7 +19,7 @@ from drakerock.errors import InputError, SimulationFailure
 from drakerock.identity import calc_config_hash, get_versions
 from drakerock.randomness import make_generator
 from drakerock.resources import find_data
-from drakerock.rocks.config import PileRecipe
+from drakerock.rocks.config import MAX_ROCKS, PileRecipe
 from drakerock.rocks.contact_graph import find_loose
 from drakerock.rocks.drake.add_rocks import AddRocks
 from drakerock.rocks.drake.drift import AddDrift
@@ -44,8 +44,10 @@ from drakerock.rocks.summary import calc_imbalance, calc_support
 Progress = Callable[[str, float], None]
 """Called with what is being done and its share done in [0, 1]."""
 
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
+# Share of the room under the emitter that rocks fill.
+PACKING = 0.6
 # The void is full when its level has stayed at the emitter for so many batches: rocks still flow out.
 FULL_BATCHES = 4
 # So many batches without room for a single rock, and it is the others' turn.
@@ -194,10 +196,11 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
     for bit.
 
     Raises:
-        InputError: a rock finds no room in the emitter.
+        InputError: more rocks than the engine takes, or a rock finds no room in the emitter.
         SimulationFailure: the dynamics failed, or the pile did not come to rest in time.
     """
-    shapes = load_rock_shapes(recipe.rocks.shapes)
+    _announce_number(recipe)
+    shapes = load_rock_shapes(recipe.rocks.shapes, recipe.rocks.max_corners)
     rng = make_generator(recipe.seed, "pile")
     site, n = recipe.site, recipe.pile.rocks
     pile = make_empty_pile()
@@ -233,9 +236,25 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
     return replace(pile, provenance=provenance)
 
 
+def _announce_number(recipe: PileRecipe) -> None:
+    """Say how many rocks are about to be simulated; InputError if the gradation makes too many of them."""
+    rocks = recipe.rocks
+    volume = calc_mean_volume(rocks, load_rock_shapes(rocks.shapes, rocks.max_corners))
+    depth = recipe.site.rear_layer if recipe.pile.rocks else recipe.site.void_depth
+    room = PACKING * depth * recipe.site.drift_width * recipe.pile.emission_height
+    number = (recipe.pile.rocks or 0) + round(room / volume)
+    if number > MAX_ROCKS:
+        least = min(rocks.gradation, key=lambda item: item.size_m)
+        raise InputError(
+            f"rocks.gradation: it makes a pile of about {number} rocks, most of them of size_m {least.size_m:g}; at "
+            f"most {MAX_ROCKS} are allowed: leave the smallest out, or make size_m larger or the site smaller"
+        )
+    _log.warning("drakerock: making a pile of about %d rocks (once)", number)
+
+
 def _count_filling(recipe: PileRecipe, depth: float) -> int:
     """Return more rocks than fit under the emitter over a depth [m]: as if they filled it without gaps."""
-    shapes = load_rock_shapes(recipe.rocks.shapes)
+    shapes = load_rock_shapes(recipe.rocks.shapes, recipe.rocks.max_corners)
     room = depth * recipe.site.drift_width * (recipe.pile.emission_height + 1.0)
     return int(np.ceil(room / calc_mean_volume(recipe.rocks, shapes)))
 
@@ -448,7 +467,7 @@ def fetch_pile(recipe: PileRecipe, progress: Progress | None = None) -> tuple[Pi
         if path.exists():
             return load_pile(path), path
     except (OSError, InputError) as error:
-        _LOG.warning("the pile is made anew: %s", error)
+        _log.warning("the pile is made anew: %s", error)
     pile = make_pile(recipe, progress)
     partial = path.with_suffix(f".{os.getpid()}.partial")  # workers may make the same pile at once
     try:
@@ -456,7 +475,7 @@ def fetch_pile(recipe: PileRecipe, progress: Progress | None = None) -> tuple[Pi
         save_pile(pile, partial)
         partial.replace(path)
     except (OSError, InputError) as error:
-        _LOG.warning("the pile is not kept for next time: %s", error)
+        _log.warning("the pile is not kept for next time: %s", error)
         with suppress(OSError):
             partial.unlink(missing_ok=True)
     return pile, path
