@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from drakerock.rocks.config import RocksConfig, SiteConfig
 from drakerock.rocks.engine.config import NonsmoothConfig
 from drakerock.rocks.engine.engine import MachineStep, NonsmoothEngine, RockArrays, StepReport
-from drakerock.rocks.engine.solver import MACHINE_ROW_WIDTH, MachineArrays
+from drakerock.rocks.engine.records import MACHINE_ROW
+from drakerock.rocks.engine.solve.machine_rows import MachineArrays
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.site import Plane, Site
 from drakerock.rocks.state import PileState
@@ -103,7 +104,7 @@ def make_machine_step(X_WBs, velocity, jacobian, response) -> MachineStep:
             jacobian @ response,
             np.zeros((0, v)),
             np.zeros((0, v)),
-            np.zeros((0, MACHINE_ROW_WIDTH)),
+            np.zeros(0, MACHINE_ROW),
         ),
         np.zeros((0, 18)),
     )

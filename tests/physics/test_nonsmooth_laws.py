@@ -295,7 +295,7 @@ def test_same_input_same_bits():
     engine = make_engine(pile, shapes, config=NonsmoothConfig())
     results.append(run(engine, half, 0.5)[0])
     for other in results[1:]:
-        for name in ("positions", "quaternions", "velocities", "book"):
+        for name in ("positions", "quaternions", "velocities", "sleep"):
             assert np.array_equal(getattr(results[0], name), getattr(other, name)), name
-        for name in ("pairs", "values"):
-            assert np.array_equal(getattr(results[0].memory, name), getattr(other.memory, name)), name
+        for name in ("pairs", "points"):
+            assert np.array_equal(getattr(results[0].cache, name), getattr(other.cache, name)), name

@@ -11,14 +11,6 @@ from drakerock.rocks.engine.machine_step import (
     calc_free_motion,
     make_machine_arrays,
 )
-from drakerock.rocks.engine.solver import (
-    LOWER,
-    NORMAL_ROW,
-    ROW_COMPLIANCE,
-    ROW_MASS,
-    TARGET,
-    UPPER,
-)
 
 N_V, N_BODIES, H = 9, 3, 0.01
 
@@ -95,15 +87,14 @@ def test_rows_measure_joints_and_points_on_the_site(rng, inertia, jacobian):
     assert np.linalg.norm(measured[2:]) == pytest.approx(np.linalg.norm(v_WP))
 
     values = arrays.row_values
-    assert np.array_equal(values[:2, [TARGET, ROW_COMPLIANCE, LOWER, UPPER]], joints[:, 2:])
-    assert values[2, [TARGET, ROW_COMPLIANCE, LOWER, UPPER]] == pytest.approx(
-        [depth / H, 1.0 / (H * H * stiffness), 0.0, np.inf]
-    )
+    law = ["target", "compliance", "lower", "upper"]
+    assert values[:2][law].tolist() == [tuple(joint) for joint in joints[:, 2:]]
+    assert values[2][law].tolist() == pytest.approx((depth / H, 1.0 / (H * H * stiffness), 0.0, np.inf))
     # Full friction, mu times the load of the penetration, at the stiction tolerance.
-    for row in (3, 4):
-        assert values[row, ROW_COMPLIANCE] * mu * H * stiffness * depth == pytest.approx(tolerance)
-        assert values[row, [LOWER, UPPER, NORMAL_ROW]].tolist() == [-mu, mu, 2]
-    assert values[:3, NORMAL_ROW].tolist() == [-1, -1, -1]
+    for row in values[3:5]:
+        assert row["compliance"] * mu * H * stiffness * depth == pytest.approx(tolerance)
+        assert row[["lower", "upper", "normal_row"]].tolist() == (-mu, mu, 2)
+    assert values["normal_row"][:3].tolist() == [-1, -1, -1]
     assert np.allclose(arrays.row_response, arrays.rows @ inverse)
     diagonal = np.diag(arrays.rows @ inverse @ arrays.rows.T)
-    assert np.allclose(values[:, ROW_MASS] * (diagonal + values[:, ROW_COMPLIANCE]), 1.0)
+    assert np.allclose(values["mass"] * (diagonal + values["compliance"]), 1.0)
