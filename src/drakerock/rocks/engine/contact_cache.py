@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drakerock.rocks.engine.compiling import Array, Record, Vector, kernel
+from drakerock.rocks.engine.compiling import Array, Record, Rotation, Vector, kernel
 from drakerock.rocks.engine.contact_law import get_impulse
 from drakerock.rocks.engine.memory_access import make_aligned_zeros, prefetch
 from drakerock.rocks.engine.records import AWAKE, CACHED_POINT, LOST
@@ -339,7 +339,7 @@ def _copy_sleeping(
 
 
 @kernel
-def _write_point(row: Record, r_a: tuple[float, ...], gap: float, point: Record) -> None:
+def _write_point(row: Record, r_a: Rotation, gap: float, point: Record) -> None:
     """Write a cached point: vectors in the first rock's frame, its gap after the step, the impulse in W."""
     point.gap = gap
     simplex = int(row.simplex)

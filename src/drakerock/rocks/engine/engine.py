@@ -65,7 +65,10 @@ __all__ = [
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+# Acceleration of free fall [m/s^2], along -z.
 GRAVITY = 9.81
+# Quaternions are taken for unit ones within this, and keep their bits.
+UNIT_TOLERANCE = 1e-14
 # How far outside the site's box a rock still counts as inside [m].
 SITE_MARGIN = 0.5
 # A step that failed is solved again with this many times the iterations and without acceleration, from a cold start
@@ -75,7 +78,7 @@ SITE_MARGIN = 0.5
 RETRY_FACTOR = 4
 DEEP_SHARE = 0.375
 # One that would make an overlap beyond this share is solved again, with contacts where its own motion would lead.
-SPECULATIVE_SHARE = 0.75
+DEEPENED_SHARE = 0.75
 
 
 class _Attempt(NamedTuple):
@@ -255,10 +258,9 @@ class NonsmoothEngine:
                 sleep["reference"][asleep] = sums[asleep]
         velocities = pile.V_WRs.copy()
         velocities[sleep["status"] != AWAKE] = 0.0
-        # Stored unit quaternions keep their bits.
         length = np.linalg.norm(pile.q_WRs, axis=1, keepdims=True)
         arrays = RockArrays(
-            np.where(np.abs(length - 1.0) < 1e-14, pile.q_WRs, pile.q_WRs / length),
+            np.where(np.abs(length - 1.0) < UNIT_TOLERANCE, pile.q_WRs, pile.q_WRs / length),
             pile.p_WRs.copy(),
             velocities,
             sleep,
@@ -446,7 +448,7 @@ class NonsmoothEngine:
         new.cache, new.n_sleeping = new.cache.select(slice(n_points)), n_sleeping
         self._velocities[self.n_rocks + 1 :] = machine.arrays.jacobian @ solution.velocity
         n_deep = self.detection.find_deep_overlaps(
-            n_rows, self.detection.rows, self._velocities, SPECULATIVE_SHARE * self.config.max_penetration
+            n_rows, self.detection.rows, self._velocities, DEEPENED_SHARE * self.config.max_penetration
         )
         self._velocities[awake] = 0.0
         n_asleep, n_lost = self._fall_asleep(new, sensors)

@@ -10,6 +10,12 @@ import math
 
 from drakerock.rocks.engine.compiling import Array, Quaternion, Rotation, Symmetric, Vector, kernel
 
+# Of a unit vector one component is 1 / sqrt(3) = 0.577 at least: tangents are made of a part that is long enough.
+LEAST_COMPONENT = 0.57
+# Below these angles series are exact to rounding, and their quotients 0 / 0 in the end [rad].
+SMALL_ANGLE = 1e-4
+SMALL_HALF_ANGLE = 1e-6
+
 
 @kernel
 def get_vector(values: Array) -> Vector:
@@ -104,7 +110,7 @@ def rotate_symmetric(r: Rotation, m: Symmetric) -> Symmetric:
 def make_tangents(n: Vector) -> tuple[Vector, Vector]:
     """Return two unit vectors that complete a unit vector to a right-handed frame."""
     nx, ny, nz = n
-    if abs(nx) > 0.57:
+    if abs(nx) > LEAST_COMPONENT:
         factor = 1.0 / math.sqrt(nx * nx + ny * ny)
         tx, ty, tz = -ny * factor, nx * factor, 0.0
     else:
@@ -158,7 +164,7 @@ def rotate_quaternion(q: Quaternion, a: Vector) -> Quaternion:
     angle2 = dot(a, a)
     half = 0.5 * math.sqrt(angle2)
     # sin(h) / (2 h), by its series where h is small
-    factor = math.sin(half) / (2.0 * half) if half > 1e-6 else 0.5 - angle2 / 48.0
+    factor = math.sin(half) / (2.0 * half) if half > SMALL_HALF_ANGLE else 0.5 - angle2 / 48.0
     c, u, v, s = math.cos(half), factor * a[0], factor * a[1], factor * a[2]
     nw = c * w - u * x - v * y - s * z
     nx = c * x + u * w + v * z - s * y
@@ -175,8 +181,8 @@ def rotate_rotation(r: Rotation, a: Vector) -> Rotation:
     angle2 = x * x + y * y + z * z
     angle = math.sqrt(angle2)
     # sin(t) / t and (1 - cos(t)) / t^2, by their series where t is small
-    s = math.sin(angle) / angle if angle > 1e-4 else 1.0 - angle2 / 6.0
-    c = (1.0 - math.cos(angle)) / angle2 if angle > 1e-4 else 0.5 - angle2 / 24.0
+    s = math.sin(angle) / angle if angle > SMALL_ANGLE else 1.0 - angle2 / 6.0
+    c = (1.0 - math.cos(angle)) / angle2 if angle > SMALL_ANGLE else 0.5 - angle2 / 24.0
     t = 1.0 - c * angle2
     m0, m1, m2 = t + c * x * x, c * x * y - s * z, c * x * z + s * y
     m3, m4, m5 = c * x * y + s * z, t + c * y * y, c * y * z - s * x

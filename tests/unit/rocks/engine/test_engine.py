@@ -681,6 +681,15 @@ def test_settings_are_checked():
         RestConfig(wake_load=0.0)
 
 
+def test_the_schema_marks_all_but_a_users_settings_as_advanced():
+    schema = NonsmoothConfig.model_json_schema()
+    groups = [schema["properties"], schema["$defs"]["RestConfig"]["properties"]]
+    plain = [name for group in groups for name, item in group.items() if not item.get("advanced")]
+    assert plain == [
+        "iterations", "stiffness_factor", "linear_overlap", "rounding", "reduction", "rest", "max_penetration"
+    ]  # fmt: skip
+
+
 def test_a_damaged_pile_file_is_refused(tmp_path):
     engine, arrays = settle(5)
     path = tmp_path / "pile.npz"

@@ -108,7 +108,7 @@ def test_rocks_that_are_spun_by_what_falls_on_them_do_not_end_up_in_each_other(m
     """Of the first 400 falls 34 go deeper than 40 mm without looking ahead, 7 with it; these are some of the former."""
     seeds = (1, 28, 35, 45, 58, 63, 73, 80, 104, 134, 142, 149)
     with_them = [calc_deepest(seed) for seed in seeds]
-    monkeypatch.setattr(engine_module, "SPECULATIVE_SHARE", np.inf)
+    monkeypatch.setattr(engine_module, "DEEPENED_SHARE", np.inf)
     without = [calc_deepest(seed) for seed in seeds]
     assert all(n_redone == 0 for _, n_redone in without)
     assert all(n_redone > 0 for _, n_redone in with_them)

@@ -22,6 +22,8 @@ IntArray = NDArray[np.int64]
 # A cell of a grid is this wide [largest radius of its rocks]: a rock's neighbours are in few cells, and few rocks in
 # each.
 CELL_WIDTH = 1.3
+# On the logarithm's argument: a rock twice as large as the smallest is in the next class, whatever rounding says.
+CLASS_TOLERANCE = 1.0001
 
 
 class SiteBox(NamedTuple):
@@ -240,6 +242,6 @@ def _make_size_classes(radius: Array) -> list[tuple[IntArray, float]]:
     """Return the rocks by classes of size (a factor of two each) with the largest radius of each class [m]."""
     if len(radius) == 0:
         return []
-    level = np.floor(np.log2(radius / radius.min() * 1.0001)).astype(np.int64)
+    level = np.floor(np.log2(radius / radius.min() * CLASS_TOLERANCE)).astype(np.int64)
     classes = [np.flatnonzero(level == k) for k in np.unique(level)]
     return [(rocks, float(radius[rocks].max())) for rocks in classes]

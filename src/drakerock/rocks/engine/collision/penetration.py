@@ -34,7 +34,7 @@ _Axis = tuple[float, Vector, Vector]
 
 @kernel
 def _is_allowed(direction: Vector, history: Vector, min_cosine: float) -> bool:
-    """Return whether a direction is near enough to the one in which the pair was pushed before, if that is known."""
+    """Return whether a direction is near enough to the one in which the pair was pushed before (unit, or zero)."""
     return not (dot(history, history) > 0.5 and dot(direction, history) < min_cosine)
 
 

@@ -21,6 +21,9 @@ from drakerock.rocks.engine.vectors import (
     subtract,
 )
 
+# By how much a rock's turning extends its box at most [m/s]: a rock that spins faster is searched no farther around.
+MAX_TURNING = 1.0
+
 
 class CollisionBodies(NamedTuple):
     """All bodies that touch: rocks, static pieces, planes, pieces of the machine (n bodies).
@@ -138,7 +141,7 @@ def calc_poses(
         first, last = shapes.vertex_start[shape], shapes.vertex_start[shape + 1]
         extra = scale * shapes.rounding[shape] + margin
         spin = math.sqrt(velocities[i, 0] ** 2 + velocities[i, 1] ** 2 + velocities[i, 2] ** 2)
-        extra += time_step * min(spin * scale * shapes.radius[shape], 1.0)
+        extra += time_step * min(spin * scale * shapes.radius[shape], MAX_TURNING)
         for axis in range(3):
             row = (r[3 * axis], r[3 * axis + 1], r[3 * axis + 2])
             for d in range(3):
