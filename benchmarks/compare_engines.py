@@ -44,9 +44,10 @@ from rocks import ROCKS, SHAPES, TIME_STEP, Motors, calc_bucket_mass, clear_way,
 from drakerock.lhd.config import MachineConfig
 from drakerock.lhd.model import add_machine, calc_motor_targets
 from drakerock.lhd.placement import set_machine_pose
-from drakerock.rocks.drake.assembly import add_plant, add_site
-from drakerock.rocks.drake.plant_engine import add_plant_rocks, add_rock_bodies
-from drakerock.rocks.drake.system import add_nonsmooth_rocks
+from drakerock.lhd.rocks import add_lhd_rocks
+from drakerock.rocks.drake.drift import AddDrift
+from drakerock.rocks.drake.plant import add_plant
+from drakerock.rocks.drake.plant_engine import AddRockBodies
 from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig, PlantEngineConfig
 from drakerock.rocks.site import make_site
 from drakerock.rocks.state import PileState
@@ -107,21 +108,14 @@ class Dig:
         )
         builder = DiagramBuilder()
         self.plant, scene_graph = add_plant(builder, dynamics)
-        built = make_site(SMALL_SITE)
-        add_site(self.plant, built, dynamics)
+        AddDrift(self.plant, make_site(SMALL_SITE), dynamics.plant)
         self.machine = add_machine(self.plant, MachineConfig())
-        inputs = []
+        bodies = None
         if dynamics.rocks == "plant":
-            geometries = add_rock_bodies(self.plant, pile, SHAPES, ROCKS, dynamics)
-            self.plant.Finalize()
-            self.rocks = add_plant_rocks(builder, self.plant, pile, geometries)
-        else:
-            self.plant.Finalize()
-            self.rocks, view = add_nonsmooth_rocks(
-                builder, self.plant, scene_graph, self.machine, built, SHAPES, ROCKS, dynamics, pile
+            bodies = AddRockBodies(
+                self.plant, pile, ROCKS, dynamics.plant, dynamics.reference_overlap, SHAPES
             )
-            inputs.append(view.GetInputPort("desired_state"))
-        inputs.append(self.plant.get_desired_state_input_port(self.machine.instance))
+        self.plant.Finalize()
         rates = make_dig(depth)
 
         def delayed(t: float) -> np.ndarray:
@@ -129,8 +123,15 @@ class Dig:
             return calc_motor_targets(self.plant, self.machine, *wanted)
 
         motors = builder.AddSystem(Motors(delayed, len(delayed(0.0))))
-        for port in inputs:
-            builder.Connect(motors.GetOutputPort("desired_state"), port)
+        builder.Connect(
+            motors.GetOutputPort("desired_state"),
+            self.plant.get_desired_state_input_port(self.machine.instance),
+        )
+        self.rocks = add_lhd_rocks(
+            builder, self.plant, scene_graph, self.machine, pile, ROCKS, dynamics, SMALL_SITE,
+            shapes=SHAPES, bodies=bodies,
+        )  # fmt: skip
+        self.bucket_force = self.rocks.get_body_force_output_port(self.plant.GetBodyByName("bucket").index())
         self.simulator = Simulator(builder.Build())
         self.root = self.simulator.get_mutable_context()
         self.plant_context = self.plant.GetMyMutableContextFromRoot(self.root)
@@ -157,7 +158,7 @@ class Dig:
         context = self.rocks.GetMyContextFromRoot(self.root)
         for k in range(round(duration / time_step)):
             self.simulator.AdvanceTo(start + (k + 1) * time_step)
-            yield -self.rocks.GetOutputPort("F_B_W").Eval(context)[3]
+            yield -self.bucket_force.Eval(context)[3]
 
     def get_reach(self) -> float:
         """Return where the tip of the bucket is along x [m]."""

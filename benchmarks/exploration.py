@@ -23,7 +23,8 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.distance import cdist
 
-from drakerock.exploration.pareto import ParetoConfig, pareto_front
+from drakerock.exploration.config import ParetoConfig, SamplingConfig, SensitivityConfig
+from drakerock.exploration.pareto import pareto_front
 from drakerock.exploration.problems import (
     KnownProblem,
     calc_loading_spread,
@@ -36,12 +37,11 @@ from drakerock.exploration.problems import (
 )
 from drakerock.exploration.sampling import (
     SAMPLERS,
-    SamplingConfig,
     make_initial_design,
     make_sampler,
     make_validation_points,
 )
-from drakerock.exploration.sensitivity import SensitivityConfig, calc_sensitivity
+from drakerock.exploration.sensitivity import calc_sensitivity
 from drakerock.exploration.surrogate import Kriging, Surrogate, calc_ranges, fit_surrogate
 from drakerock.exploration.validation import validate
 from drakerock.study.analysis import run_report

@@ -18,7 +18,7 @@ differences show; what it leaves out is that variants come to different states.
 `held` stops a dig with reduction at some times, and goes on from there for half a second by its own rule and with all
 rocks awake: what moves more then was held back by the rule. That tells rules apart in a few digs.
 
-Runs are stored beside the docs, with the letter of the engine that made them. Those that are stored already are
+Runs are stored beside the docs, with the results revision that made them. Those that are stored already are
 skipped, so a study can be stopped and continued, also at another time.
 """
 
@@ -52,13 +52,14 @@ from rocks import (
 )
 from scipy import stats
 
+from drakerock.identity import RESULTS_REVISION
 from drakerock.loading.config import LoadingConfig
 from drakerock.loading.cycle import run_cycle
 from drakerock.loading.scenario import Scenario
-from drakerock.rocks.config import PileConfig, SiteConfig
+from drakerock.rocks.config import PileConfig, PileRecipe, SiteConfig
 from drakerock.rocks.drake.system import NonsmoothRocks
 from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
-from drakerock.rocks.making.settling import PileRecipe, make_pile
+from drakerock.rocks.making.settling import make_pile
 from drakerock.rocks.state import PileState
 
 # Per size of pile: number of rocks, site and emission height.
@@ -67,8 +68,6 @@ SIZES = {
     "1000": (1000, SiteConfig(drift_width=6.5, void_depth=2.2, rear_layer=0.0), 6.0),
     "full": (0, SITE, 8.0),
 }
-# To be changed with every change of the engine that changes results; docs/validation/nonsmooth.md says what it means.
-ENGINE = "K"
 OUT = Path(__file__).parents[1] / "docs" / "validation" / "faithfulness"
 # Strategies of `cycles`, in turn, each varied by so much to either side.
 STRATEGIES = ((0.3, 0.6, 0.6, 0.2), (1.8, 0.1, 0.2, 1.0))
@@ -189,7 +188,9 @@ def store(
         rounded = {
             key: value if isinstance(value, list) else float(f"{value:.6g}") for key, value in values.items()
         }
-        file.write(json.dumps({"seed": seed, "variant": variant, "engine": ENGINE, **rounded}) + "\n")
+        file.write(
+            json.dumps({"seed": seed, "variant": variant, "results": RESULTS_REVISION, **rounded}) + "\n"
+        )
     means = {k: round(float(np.mean(values[k])), 3) for k in metrics if k in values}
     print(path.stem, seed, variant, means, flush=True)
 
@@ -326,6 +327,7 @@ def continue_dig(
     with go_on_with(simulator, rocks, settings) as other:
         root = other.get_mutable_context()
         context = rocks.GetMyContextFromRoot(root)
+        bucket_force = rocks.get_body_force_output_port(plant.GetBodyByName("bucket").index())
         tip = plant.GetFrameByName("tip")
         plant_context = plant.GetMyContextFromRoot(root)
         before, masses = rocks.get_pile(root), rocks.engine.mass
@@ -333,7 +335,7 @@ def continue_dig(
         forces, start, cpu = [], root.get_time(), time.process_time()
         for k in range(round(STATE_TIME / TIME_STEP)):
             other.AdvanceTo(start + (k + 1) * TIME_STEP)
-            forces.append(-rocks.GetOutputPort("F_B_W").Eval(context)[3] / 1e3)
+            forces.append(-bucket_force.Eval(context)[3] / 1e3)
         cpu = time.process_time() - cpu
         after = rocks.get_pile(root)
         way = np.linalg.norm(after.p_WRs - before.p_WRs, axis=1)
@@ -350,9 +352,9 @@ def continue_dig(
 
 
 def read(path: Path) -> list[dict]:
-    """Return the stored runs of this engine."""
+    """Return the stored runs of this results revision."""
     lines = path.read_text().splitlines() if path.exists() else []
-    return [run for run in map(json.loads, lines) if run["engine"] == ENGINE]
+    return [run for run in map(json.loads, lines) if run["results"] == RESULTS_REVISION]
 
 
 def compare(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:

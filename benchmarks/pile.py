@@ -32,7 +32,7 @@ SHAPES = load_rock_shapes(RECIPE.rocks.shapes)
 
 def bench_make() -> None:
     # The kernels are compiled (or read from the cache) beforehand.
-    make_pile(RECIPE.model_copy(update={"pile": RECIPE.pile.model_copy(update={"rocks": 5})}))
+    make_pile(RECIPE.replace(**{"pile.rocks": 5}))
     start = time.process_time()
     pile = make_pile(RECIPE)
     cpu = time.process_time() - start
@@ -84,10 +84,7 @@ def bench_refill() -> None:
         resting[chosen] = False
         assert after.contacts is not None
         woken = replace(after, contacts=replace(after.contacts, resting=resting))
-        rest = RECIPE.dynamics.nonsmooth.rest.model_copy(update={"time": 1e9})
-        nonsmooth = RECIPE.dynamics.nonsmooth.model_copy(update={"rest": rest})
-        dynamics = RECIPE.dynamics.model_copy(update={"nonsmooth": nonsmooth})
-        later, _ = settle(woken, SHAPES, RECIPE.model_copy(update={"dynamics": dynamics}), 5.0)
+        later, _ = settle(woken, SHAPES, RECIPE.replace(**{"dynamics.nonsmooth.rest.time": 1e9}), 5.0)
         moved = 1e3 * np.linalg.norm(later.p_WRs - after.p_WRs, axis=1)[chosen]
         print(
             f"refill: the 300 rocks nearest to the hole woken for 5 s: mean {moved.mean():.2f} mm, "

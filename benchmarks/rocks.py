@@ -22,17 +22,19 @@ from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from drakerock.lhd.config import MachineConfig
 from drakerock.lhd.model import Machine, add_machine, calc_motor_targets
 from drakerock.lhd.placement import set_machine_pose
+from drakerock.lhd.rocks import add_lhd_rocks
 from drakerock.loading.cycle import run_cycle
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.rocks.config import RocksConfig, SiteConfig
-from drakerock.rocks.drake.assembly import add_plant, add_site
+from drakerock.rocks.drake.drift import AddDrift
 from drakerock.rocks.drake.interface import ROCK_SUMMARY
-from drakerock.rocks.drake.system import NonsmoothRocks, add_nonsmooth_rocks
+from drakerock.rocks.drake.plant import add_plant
+from drakerock.rocks.drake.system import NonsmoothRocks
 from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
 from drakerock.rocks.engine.engine import NonsmoothEngine
 from drakerock.rocks.making.settling import fetch_pile
 from drakerock.rocks.shapes import load_rock_shapes
-from drakerock.rocks.site import make_site
+from drakerock.rocks.site import make_site, make_surroundings
 from drakerock.rocks.state import PileState, load_pile
 
 ROCKS = RocksConfig()
@@ -45,7 +47,7 @@ def make_engine(pile: PileState, site: SiteConfig = SITE, **settings: object) ->
     return NonsmoothEngine(
         ROCKS,
         SHAPES,
-        make_site(site),
+        make_surroundings(make_site(site)),
         NonsmoothConfig(**settings),
         TIME_STEP,
         pile.shape,
@@ -190,17 +192,15 @@ def build_dig(
     dynamics = DynamicsConfig(rocks="nonsmooth", nonsmooth=config, time_step=time_step)
     builder = DiagramBuilder()
     plant, scene_graph = add_plant(builder, dynamics)
-    built = make_site(site)
-    add_site(plant, built, dynamics)
+    AddDrift(plant, make_site(site), dynamics.plant)
     machine = add_machine(plant, MachineConfig())
     plant.Finalize()
-    rocks, view = add_nonsmooth_rocks(
-        builder, plant, scene_graph, machine, built, SHAPES, ROCKS, dynamics, pile
-    )
     size = len(calc_motor_targets(plant, machine, 0.0, 0.0, 0.0))
     motors = builder.AddSystem(Motors(lambda t: calc_motor_targets(plant, machine, *rates(t)), size))
-    for port in (plant.get_desired_state_input_port(machine.instance), view.GetInputPort("desired_state")):
-        builder.Connect(motors.GetOutputPort("desired_state"), port)
+    builder.Connect(
+        motors.GetOutputPort("desired_state"), plant.get_desired_state_input_port(machine.instance)
+    )
+    rocks = add_lhd_rocks(builder, plant, scene_graph, machine, pile, ROCKS, dynamics, site, shapes=SHAPES)
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
     x_tip = float(pile.p_WRs[:, 0].min()) - 0.7
@@ -226,6 +226,7 @@ def run_dig(
     simulator, plant, _machine, rocks = build_dig(pile, rates, config, time_step, site, y)
     root = simulator.get_mutable_context()
     context = rocks.GetMyContextFromRoot(root)
+    bucket_force = rocks.get_body_force_output_port(plant.GetBodyByName("bucket").index())
     plant_context = plant.GetMyContextFromRoot(root)
     rocks.get_report(root)  # loads the compiled kernels
     n_steps = round(duration / time_step)
@@ -241,8 +242,8 @@ def run_dig(
         cpu -= time.process_time()
         simulator.AdvanceTo((k + 1) * time_step)
         cpu += time.process_time()
-        forces[k] = rocks.GetOutputPort("F_B_W").Eval(context)
-        summaries[k] = rocks.GetOutputPort("rock_summary").Eval(context)
+        forces[k] = bucket_force.Eval(context)
+        summaries[k] = rocks.GetOutputPort("summary").Eval(context)
         reach[k] = tip.CalcPoseInWorld(plant_context).translation()[0] - start
         if k % 10 == 0:
             fastest = max(fastest, float(np.abs(rocks.get_pile(root).V_WRs[:, 3:]).max()))
@@ -319,7 +320,7 @@ def bench_scaling(pile: PileState) -> None:
     total = pile
     for k in range(1, n_blocks + 1):
         total = total.join(replace(block, p_WRs=block.p_WRs + [k * width, 0.0, 0.0]))
-    site = SITE.model_copy(update={"void_depth": SITE.void_depth + n_blocks * width})
+    site = SITE.replace(void_depth=SITE.void_depth + n_blocks * width)
     bench_resting(total, site)
     few, many = bench_idle(pile, SITE), bench_idle(total, site)
     print(

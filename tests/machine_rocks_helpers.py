@@ -11,9 +11,10 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from drakerock.lhd.config import MachineConfig
 from drakerock.lhd.model import add_machine, calc_motor_targets
 from drakerock.lhd.placement import set_machine_pose
+from drakerock.lhd.rocks import add_lhd_rocks
 from drakerock.rocks.config import RocksConfig, SiteConfig
-from drakerock.rocks.drake.assembly import add_plant, add_site
-from drakerock.rocks.drake.system import add_nonsmooth_rocks
+from drakerock.rocks.drake.drift import AddDrift
+from drakerock.rocks.drake.plant import add_plant
 from drakerock.rocks.engine.config import DynamicsConfig
 from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.site import make_site
@@ -44,26 +45,18 @@ class Scene:
         self.site = make_site(site or SiteConfig())
         builder = DiagramBuilder()
         self.plant, self.scene_graph = add_plant(builder, self.dynamics)
-        add_site(self.plant, self.site, self.dynamics)
+        AddDrift(self.plant, self.site, self.dynamics.plant)
         self.machine = add_machine(self.plant, MachineConfig())
         self.plant.Finalize()
-        self.rocks, view = add_nonsmooth_rocks(
-            builder,
-            self.plant,
-            self.scene_graph,
-            self.machine,
-            self.site,
-            self.shapes,
-            rocks,
-            self.dynamics,
-            pile,
-        )
         source = builder.AddSystem(Rates(self.plant, self.machine, rates))
         builder.Connect(
             source.GetOutputPort("desired_state"),
             self.plant.get_desired_state_input_port(self.machine.instance),
         )
-        builder.Connect(source.GetOutputPort("desired_state"), view.GetInputPort("desired_state"))
+        self.rocks = add_lhd_rocks(
+            builder, self.plant, self.scene_graph, self.machine, pile, rocks, self.dynamics, self.site.config,
+            shapes=self.shapes,
+        )  # fmt: skip
         self.diagram = builder.Build()
         self.simulator = Simulator(self.diagram)
         self.context = self.simulator.get_mutable_context()
@@ -76,14 +69,11 @@ class Scene:
 
     def get_bucket_force(self) -> np.ndarray:
         """(6,) of the last step."""
-        return self.rocks.GetOutputPort("F_B_W").Eval(self.rocks.GetMyContextFromRoot(self.context)).copy()
+        port = self.rocks.get_body_force_output_port(self.plant.GetBodyByName("bucket").index())
+        return port.Eval(self.rocks.GetMyContextFromRoot(self.context)).copy()
 
     def get_summary(self) -> np.ndarray:
-        return (
-            self.rocks.GetOutputPort("rock_summary")
-            .Eval(self.rocks.GetMyContextFromRoot(self.context))
-            .copy()
-        )
+        return self.rocks.GetOutputPort("summary").Eval(self.rocks.GetMyContextFromRoot(self.context)).copy()
 
     def get_torque(self, joint: str) -> float:
         index = [

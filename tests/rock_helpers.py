@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
+from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from drakerock.rocks.config import RocksConfig, SiteConfig
-from drakerock.rocks.engine.config import NonsmoothConfig
+from drakerock.rocks.drake.add_rocks import AddRocks
+from drakerock.rocks.drake.drift import AddDrift
+from drakerock.rocks.drake.plant import add_plant
+from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
 from drakerock.rocks.engine.engine import MachineStep, NonsmoothEngine, RockArrays, StepReport
 from drakerock.rocks.engine.records import MACHINE_ROW
 from drakerock.rocks.engine.solve.machine_rows import MachineArrays
 from drakerock.rocks.shapes import RockShape
-from drakerock.rocks.site import Plane, Site
+from drakerock.rocks.site import Plane, Site, calc_bounds, make_surroundings
 from drakerock.rocks.state import PileState
 
 
@@ -81,7 +85,7 @@ def make_engine(
     return NonsmoothEngine(
         rocks or RocksConfig(),
         shapes,
-        site or make_plane_site(),
+        make_surroundings(site or make_plane_site()),
         config or NonsmoothConfig(reduction="none"),
         time_step,
         pile.shape,
@@ -89,6 +93,19 @@ def make_engine(
         pile.fixed,
         **options,
     )
+
+
+def make_rock_diagram(pile: PileState, shapes, site: Site, config: NonsmoothConfig | None = None):
+    """A Diagram with rocks on a site and nothing that moves but them; and their system."""
+    builder = DiagramBuilder()
+    plant, scene_graph = add_plant(builder, DynamicsConfig())
+    AddDrift(plant, site)
+    plant.Finalize()
+    rocks = AddRocks(
+        builder, plant, scene_graph, pile,
+        engine=config or NonsmoothConfig(reduction="none"), shapes=shapes, bounds=calc_bounds(site.config),
+    )  # fmt: skip
+    return builder.Build(), rocks
 
 
 def make_machine_step(X_WBs, velocity, jacobian, response) -> MachineStep:

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from drakerock.config import calc_config_hash
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.files import write_text
-from drakerock.loading.cycle import CycleOutcome
+from drakerock.identity import calc_config_hash
+from drakerock.loading.outcome import CycleOutcome
 from drakerock.randomness import make_generator
 
 DURATION = float(os.environ.get("STUDY_WORK_SECONDS", "0.05"))

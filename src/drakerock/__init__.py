@@ -16,10 +16,7 @@ only at an input edge, and then in the name (``_deg``).
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.metadata import version as _version
 from typing import Any
-
-__version__ = _version("drakerock")
 
 # Imported on first use, so that `import drakerock` and `drakerock --help` stay fast.
 _LAZY: dict[str, str] = {
@@ -41,6 +38,8 @@ __all__ = ["__version__", *_LAZY]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return import_module("importlib.metadata").version("drakerock")
     if name in _LAZY:
         return getattr(import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'drakerock' has no attribute {name!r}")

@@ -7,6 +7,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -118,6 +119,9 @@ def load(
         bool, typer.Option(help="Write replay.html, of each loading; about 13 MB at full size.")
     ] = True,
     figures: Annotated[bool, typer.Option("--figures", help="Write the pictures, too, as PNG.")] = False,
+    meshcat: Annotated[
+        bool, typer.Option("--meshcat", help="Show the cycle in a browser while it is computed.")
+    ] = False,
     seed: SeedOption = None,
     set_: SetOption = None,
     json_: JsonOption = False,
@@ -135,6 +139,8 @@ def load(
     if plan is not None:
         overrides.append(f"loading.planning.source={json.dumps(str(plan))}")
     config = _load(scenario, seed, [*(set_ or []), *overrides])
+    if meshcat and loadings is not None:
+        raise InputError("--meshcat: shows one cycle; leave out --loadings")
     if loadings is not None:
         with _show_progress("load") as advance:
             summary, paths = run_and_save_sequence(
@@ -148,13 +154,16 @@ def load(
         if summary["failed"]:
             raise SimulationFailure(summary["reasons"][-1])
         return
+    live = _start_meshcat() if meshcat else None
     with _show_progress("load") as advance:
-        result, paths = run_and_save(config, out, advance, replay=replay, figures=figures)
+        result, paths = run_and_save(config, out, advance, replay=replay, figures=figures, meshcat=live)
     if json_:
         print(result.to_json(), end="")
     else:
         _print_outcome(result)
         _print_paths(paths)
+    if live and sys.stdin.isatty():
+        input("Press Enter to close the live view. ")
     if result.status == "failed":
         raise SimulationFailure(result.reason)
 
@@ -192,7 +201,8 @@ def machine_check(
 
     Example: drakerock machine check studies/demo.yaml
     """
-    from drakerock.lhd.checks.checks import make_check_data, make_check_table, run_machine_checks
+    from drakerock.lhd.checks.checks import run_machine_checks
+    from drakerock.lhd.checks.rows import make_check_data, make_check_table
 
     with _show_progress("machine check"):
         rows = run_machine_checks(_load(scenario, None, set_).machine)
@@ -267,11 +277,12 @@ def study_status(folder: StudyFolder, json_: JsonOption = False) -> None:
 
     Example: drakerock study status out/smoke
     """
+    from drakerock.study.db import Store
     from drakerock.study.display import make_status_table
-    from drakerock.study.store import Store
+    from drakerock.study.status import read_status
 
     with Store.open(folder) as store:
-        status = store.read_status()
+        status = read_status(store)
     if json_:
         print(json.dumps(status))
     else:
@@ -287,7 +298,7 @@ def study_export(
 
     Example: drakerock study export out/smoke --format parquet
     """
-    from drakerock.study.store import export_tables
+    from drakerock.study.tables import export_tables
 
     _print_paths(export_tables(folder, [format_]))
 
@@ -298,10 +309,11 @@ def study_verify(folder: StudyFolder, json_: JsonOption = False) -> None:
 
     Example: drakerock study verify out/smoke
     """
-    from drakerock.study.store import Store
+    from drakerock.study.db import Store
+    from drakerock.study.verify import verify_store
 
     with Store.open(folder) as store:
-        faults = store.verify()
+        faults = verify_store(store)
     if json_:
         print(json.dumps([vars(fault) for fault in faults]))
     else:
@@ -379,15 +391,39 @@ def strategy(
     print(json.dumps(chosen.to_dict(), indent=2) if json_ else chosen.to_text())
 
 
-@study_app.command("schema")
-def study_schema() -> None:
-    """Print the JSON Schema of study files, for editors.
+class FileKind(StrEnum):
+    """Kinds of files that a schema describes."""
 
-    Example: drakerock study schema > study.schema.json
+    scenario = "scenario"
+    study = "study"
+
+
+@app.command()
+def schema(kind: Annotated[FileKind, typer.Argument(help="Which files.")]) -> None:
+    """Print the JSON Schema of scenario or study files, for editors.
+
+    Example: drakerock schema scenario > scenario.schema.json
+
+    Example: drakerock schema study > study.schema.json
     """
-    from drakerock.study.schema import make_json_schema
+    from drakerock.config import make_json_schema
+    from drakerock.loading.scenario import Scenario
+    from drakerock.study.schema import StudyConfig
 
-    print(json.dumps(make_json_schema(), indent=2))
+    described = Scenario if kind == FileKind.scenario else StudyConfig
+    print(json.dumps(make_json_schema(described, f"drakerock {kind}"), indent=2))
+
+
+def _start_meshcat() -> Any:
+    """Return a Meshcat server whose address is printed."""
+    from pydrake.geometry import Meshcat
+
+    try:
+        meshcat = Meshcat()
+    except RuntimeError as error:
+        raise InputError(f"--meshcat: no server can be started: {error}") from None
+    output.print(f"live view: {meshcat.web_url()}")
+    return meshcat
 
 
 def _load(path: Path | None, seed: int | None, overrides: list[str] | None) -> Any:

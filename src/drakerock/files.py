@@ -1,4 +1,4 @@
-"""Output folders and text files: made or written whole, or refused with one message."""
+"""Output folders and text files: made, read or written whole, or refused with one message."""
 
 from __future__ import annotations
 
@@ -19,7 +19,22 @@ def make_folder(folder: Path) -> None:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise InputError(f"--out {folder}: the folder cannot be written: {error.strerror}") from None
+        raise InputError(f"{folder}: the folder cannot be written: {error.strerror}") from None
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file.
+
+    Raises:
+        InputError: it is missing, or cannot be read as text.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: cannot be read: {reason}") from None
 
 
 def write_text(path: Path, text: str) -> None:

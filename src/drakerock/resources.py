@@ -8,6 +8,19 @@ _PACKAGE = Path(__file__).resolve().parent
 _CHECKOUT = _PACKAGE.parent.parent
 
 
+_PREFIX = "package://drakerock/"
+
+
+def find_file(name: str) -> Path:
+    """Return the path of a data file: ``package://drakerock/...`` is among the shipped models, all else is a path.
+
+    Raises:
+        FileNotFoundError: no such shipped file.
+    """
+    name = name.removeprefix("file://")
+    return find_data("models", name.removeprefix(_PREFIX)) if name.startswith(_PREFIX) else Path(name)
+
+
 def find_data(*parts: str) -> Path:
     """Return the path of a shipped file or folder, such as ``find_data("models", "package.xml")``.
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from drakerock.errors import InputError
+from drakerock.exploration.config import SamplingConfig
 from drakerock.exploration.problem import Objective, Problem, Variable
 from drakerock.exploration.problems import make_dtlz2, make_noisy_loading
-from drakerock.exploration.sampling import SAMPLERS, SamplingConfig, make_sampler
+from drakerock.exploration.sampling import SAMPLERS, make_sampler
 
 KNOWN = make_noisy_loading()
 METHODS = [(name,) for name in SAMPLERS] + [("lola_voronoi", "error"), ("error", "hypervolume", "front")]

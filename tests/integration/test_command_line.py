@@ -218,7 +218,7 @@ def test_pile_command(place, loaded):
         (["load", "bad.yaml"], ["bad.yaml:2", "site.drift_widht", "did you mean 'drift_width'?"]),
         (
             ["load", "small.yaml", "--alpha", "5"],
-            ["--set", "loading.strategy.alpha", "less than or equal to 2"],
+            ["override: loading.strategy.alpha", "less than or equal to 2"],
         ),
         (
             ["load", "small.yaml", "--set", "machine.model=nothing.sdf"],
@@ -236,7 +236,7 @@ def test_pile_command(place, loaded):
             ["load", "small.yaml", "--plan", "bad.json"],
             ["bad.json", "not a readable plan", "'height_field' is missing"],
         ),
-        (["load", "small.yaml", "--set", "foo.bar=1"], ["--set", "unknown key 'foo'"]),
+        (["load", "small.yaml", "--set", "foo.bar=1"], ["override: unknown key 'foo'"]),
         (["load", "."], ["cannot be read: Is a directory"]),
         (["replay", "nowhere"], ["nowhere", "no such file"]),
         (["machine", "check", "bad.yaml"], ["bad.yaml:2", "drift_widht"]),

@@ -16,7 +16,7 @@ from drakerock.rocks.engine.engine import NonsmoothEngine
 from drakerock.loading.scenario import Scenario
 from drakerock.rocks.making.emission import make_emitter, place_rocks, sample_rocks
 from drakerock.rocks.shapes import load_rock_shapes
-from drakerock.rocks.site import make_site
+from drakerock.rocks.site import make_site, make_surroundings
 from drakerock.rocks.state import make_empty_pile
 
 scenario = Scenario.model_validate({"site": {"void_depth": 3.0, "rear_layer": 0.0}})
@@ -26,7 +26,7 @@ waiting = sample_rocks(60, scenario.rocks, shapes, rng)
 pile, _ = place_rocks(waiting, make_empty_pile(), shapes, make_emitter(scenario.site, scenario.pile), rng)
 pile = replace(pile, p_WRs=pile.p_WRs - [0, 0, pile.p_WRs[:, 2].min() - 0.6])
 engine = NonsmoothEngine(
-    scenario.rocks, shapes, make_site(scenario.site), scenario.dynamics.nonsmooth, 0.01,
+    scenario.rocks, shapes, make_surroundings(make_site(scenario.site)), scenario.dynamics.nonsmooth, 0.01,
     pile.shape, pile.size, pile.fixed,
 )
 arrays = engine.make_arrays(pile)

@@ -22,8 +22,7 @@ def strip(outcomes):
 
 @pytest.fixture(scope="module")
 def scenario(small_scenario):
-    dynamics = small_scenario.dynamics.model_copy(update={"rocks": "nonsmooth"})
-    return small_scenario.model_copy(update={"dynamics": dynamics})
+    return small_scenario.replace(**{"dynamics.rocks": "nonsmooth"})
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +73,7 @@ def test_interrupted_sequence_ends_with_the_same_bits(scenario, straight, tmp_pa
 
 def test_folder_of_another_scenario_is_refused(scenario, straight):
     folder, _ = straight
-    other = scenario.model_copy(update={"seed": 99})
+    other = scenario.replace(seed=99)
     with pytest.raises(InputError, match="another scenario"):
         run_sequence(other, 1, folder)
 

@@ -12,12 +12,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from drakerock.config import calc_config_hash
 from drakerock.exploration.table import ResponseTable
+from drakerock.identity import calc_config_hash
 from drakerock.resources import find_data
+from drakerock.study.db import Store
 from drakerock.study.runner import run_study
 from drakerock.study.schema import load_study
-from drakerock.study.store import Store
+from drakerock.study.verify import verify_store
 
 COMMAND = Path(sys.executable).with_name("drakerock")
 SETTINGS = [
@@ -67,7 +68,7 @@ def test_a_real_study_killed_in_a_cycle_ends_the_same(tmp_path):
     for name in ("responses.csv", "responses.parquet"):
         assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "straight" / name).read_bytes()
     with Store.open(tmp_path / "killed") as store:
-        assert store.verify() == []
+        assert verify_store(store) == []
     table = ResponseTable.load(tmp_path / "killed")
     assert table.Y.shape == (3, 3)
     assert set(table.n_loadings) == {2}

@@ -15,16 +15,17 @@ from pathlib import Path
 import jsonschema
 import pyarrow.parquet as pq
 import pytest
-import yaml
 from typer.main import get_command
 
 import study_work
 from drakerock import cli
 from drakerock.config import parse_config
+from drakerock.loading.scenario import Scenario
 from drakerock.resources import find_data
 from drakerock.study.resimulation import Resimulation
 from drakerock.study.runner import run_study
 from drakerock.study.schema import StudyConfig
+from drakerock.yaml_reader import YamlDocument
 
 STUDY = """
 name: trial
@@ -130,16 +131,35 @@ def test_verify_says_what_is_wrong_and_where(store, run):
     assert [item["kind"] for item in json.loads(out)] == ["missing", "damaged", "orphan"]
 
 
+def read_shipped(name):
+    path = find_data("studies", f"{name}.yaml")
+    return YamlDocument(path.read_text(), str(path)).data
+
+
 def test_schema_describes_the_shipped_studies(run):
-    code, out, _ = run("study", "schema")
+    code, out, _ = run("schema", "study")
     schema = json.loads(out)
     assert code == 0
     jsonschema.Draft202012Validator.check_schema(schema)
     for name in ("smoke", "reduced", "paper", "control_parameters"):
-        study = yaml.safe_load(find_data("studies", f"{name}.yaml").read_text())
-        jsonschema.validate(study, schema)
-    with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate({"laodings": 3}, schema)
+        jsonschema.validate(read_shipped(name), schema)
+    jsonschema.validate({"executor": {"memory_limit": 0, "slurm": {"account": 17}}}, schema)
+    for wrong in ({"laodings": 3}, {"loadings": True}, {"scenario": {"seed": -1}}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(wrong, schema)
+
+
+def test_schema_describes_the_shipped_scenarios(run):
+    code, out, _ = run("schema", "scenario")
+    schema = json.loads(out)
+    assert code == 0
+    jsonschema.Draft202012Validator.check_schema(schema)
+    for name in ("demo", "small"):
+        jsonschema.validate(read_shipped(name), schema)
+    jsonschema.validate(Scenario().model_dump(mode="json"), schema)
+    for wrong in ({"laoding": {}}, {"rocks": {"friction": "yes"}, "seed": "x"}, {"pile": {"rocks": True}}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(wrong, schema)
 
 
 def test_confirm_report_strategy(store, run):
@@ -247,11 +267,11 @@ def test_no_study_there_is_one_line(store, run, command, tmp_path):
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        (["export", "store", "--format", "xlsx"], ["--format xlsx", "csv or parquet"]),
+        (["export", "store", "--format", "xlsx"], ["format xlsx", "csv or parquet"]),
         (["confirm", "store", "--points", "0"], ["at least one"]),
         (["run", "nothing.yaml", "--out", "new"], ["nothing.yaml", "no such file"]),
         (["run", "wrong.yaml", "--out", "new"], ["wrong.yaml:1", "laodings", "did you mean 'loadings'?"]),
-        (["run", "trial.yaml", "--out", "trial.yaml"], ["--out trial.yaml", "cannot be written"]),
+        (["run", "trial.yaml", "--out", "trial.yaml"], ["trial.yaml: the folder cannot be written"]),
         (["run", "trial.yaml", "--out", "store", "--set", "seed=4"], ["another study", "seed"]),
         (["run", "trial.yaml", "--out", "new", "--set", "sede=4"], ["sede", "did you mean 'seed'?"]),
     ],

@@ -7,8 +7,9 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from drakerock.rocks.config import RocksConfig
-from drakerock.rocks.drake.assembly import add_plant
-from drakerock.rocks.drake.plant_engine import add_plant_rocks, add_rock_bodies
+from drakerock.rocks.drake.add_rocks import AddRocks
+from drakerock.rocks.drake.plant import add_plant
+from drakerock.rocks.drake.plant_engine import AddRockBodies
 from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
 from rock_helpers import make_box, make_engine, make_pile, make_plane_site, run
 
@@ -38,10 +39,10 @@ def stand_on_nonsmooth(pile, **settings):
 def stand_on_plant(pile):
     dynamics = DynamicsConfig.model_validate({"rocks": "plant", "plant": {"contact_model": "hydroelastic"}})
     builder = DiagramBuilder()
-    plant, _ = add_plant(builder, dynamics)
-    geometries = add_rock_bodies(plant, pile, SHAPES, ROCKS, dynamics)
+    plant, scene_graph = add_plant(builder, dynamics)
+    bodies = AddRockBodies(plant, pile, ROCKS, dynamics.plant, shapes=SHAPES)
     plant.Finalize()
-    rocks = add_plant_rocks(builder, plant, pile, geometries)
+    rocks = AddRocks(builder, plant, scene_graph, pile, ROCKS, engine=bodies)
     simulator = Simulator(builder.Build())
     root = simulator.get_mutable_context()
     rocks.set_pile(root, pile)

@@ -6,28 +6,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from drakerock.config import Config
+from drakerock.exploration.config import ExplorationConfig
 from drakerock.exploration.confirmation import Confirmation
-from drakerock.exploration.pareto import Indices, ParetoConfig, ParetoFront, pareto_front, select_spread
+from drakerock.exploration.pareto import Indices, ParetoFront, pareto_front, select_spread
 from drakerock.exploration.problem import REFERENCE_STRATEGIES, Array
-from drakerock.exploration.sampling import SamplingConfig
-from drakerock.exploration.sensitivity import Sensitivity, SensitivityConfig, calc_sensitivity
+from drakerock.exploration.sensitivity import Sensitivity, calc_sensitivity
 from drakerock.exploration.strategy import Strategy, choose_strategy
-from drakerock.exploration.surrogate import Surrogate, SurrogateConfig, fit_surrogate
+from drakerock.exploration.surrogate import Surrogate, fit_surrogate
 from drakerock.exploration.table import ResponseTable
 from drakerock.exploration.validation import Accuracy, calc_learning_curve, validate
-
-
-class ExplorationConfig(Config):
-    """Everything that can be set about the exploration; the study's YAML embeds it."""
-
-    sampling: SamplingConfig = SamplingConfig()
-    surrogate: SurrogateConfig = SurrogateConfig()
-    pareto: ParetoConfig = ParetoConfig()
-    sensitivity: SensitivityConfig = SensitivityConfig()
-    n_confirm: int = Field(default=10, ge=1, description="front points to re-simulate")
 
 
 @dataclass(frozen=True)

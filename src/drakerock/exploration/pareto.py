@@ -13,11 +13,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 from pymoo.algorithms.moo.nsga2 import NSGA2
 from pymoo.core.callback import Callback
 from pymoo.core.problem import Problem as PymooProblem
@@ -26,28 +25,12 @@ from pymoo.optimize import minimize
 from pymoo.util.nds.non_dominated_sorting import NonDominatedSorting
 from scipy.spatial.distance import cdist
 
-from drakerock.config import Config
 from drakerock.errors import InputError
+from drakerock.exploration.config import Bound, ParetoConfig
 from drakerock.exploration.problem import Array, Problem
 from drakerock.randomness import derive_seed, make_generator
 
 Indices = NDArray[np.int_]
-
-
-class Bound(Config):
-    """A limit on an objective, in its natural sense and unit, such as debris <= 500."""
-
-    objective: str
-    relation: Literal["<=", ">="]
-    value: float
-
-    def __str__(self) -> str:
-        return f"{self.objective}{self.relation}{self.value:g}"
-
-    def calc_violation(self, problem: Problem, Y: Array) -> Array:
-        """Return by how much each row of Y (n, k) breaks the bound, (n,); negative where it holds."""
-        excess = Y[:, problem.get_objective(self.objective)[0]] - self.value
-        return excess if self.relation == "<=" else -excess
 
 
 def parse_bound(text: str, problem: Problem) -> Bound:
@@ -67,18 +50,6 @@ def parse_bound(text: str, problem: Problem) -> Bound:
         )
     problem.get_objective(match[1])
     return Bound(objective=match[1], relation="<=" if match[2] == "<=" else ">=", value=value)
-
-
-class ParetoConfig(Config):
-    """Settings of the search for the front."""
-
-    population: int = Field(default=300, ge=4)
-    evaluations: int = Field(default=40_000, ge=100, description="evaluations of the surrogate, about")
-    bounds: tuple[Bound, ...] = Field(default=(), description="limits on objectives")
-    max_trade_off: float | None = Field(
-        default=50.0, gt=1.0, description="M, bound of the trade-off between objectives; null: none"
-    )
-    n_draws: int = Field(default=64, ge=0, description="draws of the surrogate for the front's uncertainty")
 
 
 class Model(Protocol):

@@ -15,44 +15,21 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Literal
 
 import numpy as np
 import openturns as ot
 from numpy.typing import ArrayLike
 from openturns.experimental import LOLAVoronoi
-from pydantic import Field
 from scipy.linalg import solve_triangular
 from scipy.spatial.distance import cdist
 from scipy.stats import qmc
 
-from drakerock.config import Config
 from drakerock.errors import InputError
-from drakerock.exploration.pareto import ParetoConfig, calc_non_dominated, pareto_front
+from drakerock.exploration.config import ParetoConfig, SamplingConfig
+from drakerock.exploration.pareto import calc_non_dominated, pareto_front
 from drakerock.exploration.problem import Array, Problem
-from drakerock.exploration.surrogate import Kriging, Surrogate, SurrogateConfig, calc_correlation, calc_ranges
+from drakerock.exploration.surrogate import Kriging, Surrogate, calc_correlation, calc_ranges
 from drakerock.randomness import derive_seed, make_generator
-
-MethodName = Literal["space_filling", "lola_voronoi", "error", "variance", "hypervolume", "front"]
-
-
-class SamplingConfig(Config):
-    """The campaign's design of experiments."""
-
-    n_initial: int = Field(default=24, ge=0, description="Latin hypercube points of the initial design")
-    n_corners: int = Field(
-        default=16, ge=0, description="corner points of the initial design, at most; all 2^d when they fit"
-    )
-    n_samples: int = Field(default=204, ge=1, description="sample points in all, initial design included")
-    n_validation: int = Field(default=40, ge=0, description="random points used for validation only")
-    batch_size: int = Field(default=8, ge=1, description="points per sequential step")
-    methods: tuple[MethodName, ...] = Field(
-        default=("lola_voronoi", "error"),
-        min_length=1,
-        description="sequential methods, taken in turn per batch",
-    )
-    n_candidates: int = Field(default=2048, ge=64, description="candidate points of the sequential methods")
-    surrogate: SurrogateConfig = SurrogateConfig()
 
 
 def make_initial_design(problem: Problem, config: SamplingConfig, seed: int) -> Array:

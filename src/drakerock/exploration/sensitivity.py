@@ -13,22 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field
 from SALib.analyze import sobol as sobol_analysis
 from SALib.sample import sobol as sobol_sample
 
-from drakerock.config import Config
+from drakerock.exploration.config import SensitivityConfig
 from drakerock.exploration.problem import Array, Problem
 from drakerock.randomness import derive_seed
-
-
-class SensitivityConfig(Config):
-    """Settings of the Sobol' indices."""
-
-    n_base: int = Field(
-        default=1024, ge=64, description="base samples, a power of two; n_base (d + 2) evaluations"
-    )
-    confidence: float = Field(default=0.95, gt=0.0, lt=1.0, description="probability of the intervals")
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from drakerock.errors import InputError
-from drakerock.exploration.pareto import Bound, ParetoFront
+from drakerock.exploration.config import Bound
+from drakerock.exploration.pareto import ParetoFront
 from drakerock.exploration.problem import Array, Problem, format_number
 
 

@@ -16,7 +16,6 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field
 from scipy.linalg import cho_solve, solve_triangular
 from scipy.optimize import minimize
 from scipy.stats import qmc
@@ -33,8 +32,8 @@ from sklearn.gaussian_process.kernels import (
 )
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from drakerock.config import Config
 from drakerock.errors import InputError
+from drakerock.exploration.config import SurrogateConfig
 from drakerock.exploration.problem import Array, Problem
 from drakerock.exploration.table import ResponseTable
 from drakerock.randomness import derive_seed
@@ -294,18 +293,6 @@ def _climb(objective: Callable[..., Any], start: Array, bounds: Array) -> tuple[
     return result.x, float(result.fun)
 
 
-class SurrogateConfig(Config):
-    """How the surrogate is fitted."""
-
-    p: float | tuple[float, ...] = Field(default=2.0, description="exponent of the correlation, in (0, 2]")
-    n_starts: int = Field(default=16, ge=1, description="starting points of the maximum likelihood")
-    trend: Literal["mean", "likelihood"] = Field(
-        default="mean",
-        description="constant trend: the mean of the responses, or that of greatest likelihood",
-    )
-    use_noise: bool = Field(default=True, description="use the points' standard errors where they are known")
-
-
 class Surrogate(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """The objectives as functions of the design variables: one `Kriging` per objective.
 
@@ -408,4 +395,4 @@ def calc_ranges(Y: ArrayLike) -> Array:
     return np.where(spread > 0.0, spread, 1.0)
 
 
-__all__: Sequence[str] = ["Kriging", "PowerExponential", "Surrogate", "SurrogateConfig", "fit_surrogate"]
+__all__: Sequence[str] = ["Kriging", "PowerExponential", "Surrogate", "fit_surrogate"]

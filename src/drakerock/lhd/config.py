@@ -37,6 +37,8 @@ class MachineData(Config):
 class MachineConfig(Config):
     """Which machine, and what differs from its SDFormat file."""
 
+    file_fields = ("model",)
+
     model: str = Field(
         default="package://drakerock/lhd/lhd.sdf",
         description="the SDFormat file: a path, or package://drakerock/...",
@@ -51,13 +53,3 @@ class MachineConfig(Config):
         default=0.0, ge=-45, le=45, description="angle held at the articulation, positive turns left [deg]"
     )
     expected: MachineData = MachineData()
-
-
-class CheckConfig(Config):
-    """The bench on which the machine is checked."""
-
-    time_step: float = Field(default=0.01, gt=0, description="of the plant [s]")
-    contact_approximation: str = Field(default="lagged", pattern="^(lagged|similar|sap)$")
-    floor_friction: float = Field(default=1.125, gt=0, description="of the floor; tyres bring their own")
-    floor_stiffness: float = Field(default=1e10, gt=0, description="of floor and obstacles [N/m]")
-    floor_dissipation: float = Field(default=1.0, ge=0, description="of floor and obstacles [s/m]")

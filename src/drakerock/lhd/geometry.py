@@ -5,28 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import (
-    Box,
-    Convex,
-    Cylinder,
-    Ellipsoid,
-    GeometryId,
-    Mesh,
-    SceneGraph,
-    SceneGraphInspector,
-    Shape,
-    Sphere,
-)
-from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.geometry import GeometryId, SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
 
-from drakerock.errors import InputError
 from drakerock.lhd import names
 from drakerock.lhd.model import Machine
+from drakerock.rocks.drake.geometry import ConvexPiece, read_body_pieces
 
 Array = np.ndarray
-
-# Of what has no ``drake:point_contact_stiffness`` [N/m].
-POINT_STIFFNESS = 1e8
 
 
 @dataclass(frozen=True)
@@ -46,21 +32,6 @@ class BucketGeometry:
     load_region: Array
     inner_width: float
     outer_width: float
-
-
-@dataclass(frozen=True)
-class CollisionPiece:
-    """A convex piece of a body.
-
-    Attributes:
-        vertices: (k, 3) in the body's frame [m].
-        mu: its Coulomb friction.
-        stiffness: of its point contacts, in series with the other body's [N/m].
-    """
-
-    vertices: Array
-    mu: float
-    stiffness: float
 
 
 def make_bucket_geometry(plant: MultibodyPlant, scene_graph: SceneGraph, machine: Machine) -> BucketGeometry:
@@ -102,59 +73,25 @@ def calc_heaped_capacity(bucket: BucketGeometry) -> float:
     return calc_area(bucket.profile) * width + heap
 
 
+def find_pads(plant: MultibodyPlant, scene_graph: SceneGraph, machine: Machine) -> tuple[GeometryId, ...]:
+    """Return the bucket's wear pads: proximity geometries that touch the floor only."""
+    inspector = scene_graph.model_inspector()
+    return tuple(
+        geometry
+        for index in plant.GetBodyIndices(machine.instance)
+        for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(index))
+        if inspector.GetName(geometry).split("::")[-1].startswith(names.PAD)
+    )
+
+
 def collision_pieces(
     plant: MultibodyPlant, scene_graph: SceneGraph, machine: Machine
-) -> dict[str, list[CollisionPiece]]:
+) -> dict[str, list[ConvexPiece]]:
     """Return the machine's contact shapes as convex pieces by body name, without the bucket's wear pads.
 
     Round shapes become polyhedra: a tyre is 24 facets around and 5 rings across.
     """
-    inspector = scene_graph.model_inspector()
-    pieces: dict[str, list[CollisionPiece]] = {}
-    for index in plant.GetBodyIndices(machine.instance):
-        body = plant.get_body(index)
-        for geometry in plant.GetCollisionGeometriesForBody(body):
-            if inspector.GetName(geometry).split("::")[-1].startswith(names.PAD):
-                continue
-            X_BG = inspector.GetPoseInFrame(geometry)
-            vertices = _make_vertices(inspector, geometry)
-            piece = CollisionPiece(
-                (X_BG.rotation().matrix() @ vertices.T).T + X_BG.translation(),
-                *get_material(inspector, geometry),
-            )
-            pieces.setdefault(body.name(), []).append(piece)
-    return pieces
-
-
-def get_material(inspector: SceneGraphInspector, geometry: GeometryId) -> tuple[float, float]:
-    """Return a collision geometry's dynamic friction and the stiffness of its point contacts [N/m]."""
-    properties = inspector.GetProximityProperties(geometry)
-    friction: CoulombFriction = properties.GetProperty("material", "coulomb_friction")  # type: ignore[assignment]
-    stiffness = properties.GetPropertyOrDefault("material", "point_contact_stiffness", POINT_STIFFNESS)
-    return float(friction.dynamic_friction()), float(stiffness)
-
-
-def _make_vertices(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
-    shape: Shape = inspector.GetShape(geometry)
-    if isinstance(shape, Convex | Mesh):
-        hull = inspector.GetConvexHull(geometry)
-        return np.array([hull.vertex(i) for i in range(hull.num_vertices())])
-    if isinstance(shape, Box):
-        return np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T * shape.size() / 2
-    around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    if isinstance(shape, Cylinder):
-        ring = np.column_stack([np.cos(around), np.sin(around), np.zeros(24)]) * shape.radius()
-        return np.vstack([ring + np.array([0, 0, side * shape.length() / 2]) for side in (-1, 1)])
-    if isinstance(shape, Ellipsoid | Sphere):
-        radii = [shape.radius()] * 3 if isinstance(shape, Sphere) else [shape.a(), shape.b(), shape.c()]
-        return np.vstack(
-            [
-                np.column_stack(
-                    [np.cos(around) * np.sqrt(1 - s * s), np.full(24, s), np.sin(around) * np.sqrt(1 - s * s)]
-                )
-                for s in (-0.9, -0.5, 0.0, 0.5, 0.9)
-            ]
-        ) * np.array(radii)
-    raise InputError(
-        f"collision shape {type(shape).__name__} of {inspector.GetName(geometry)} is not supported"
-    )
+    pads = find_pads(plant, scene_graph, machine)
+    bodies = [plant.get_body(index) for index in plant.GetBodyIndices(machine.instance)]
+    pieces = {body.name(): read_body_pieces(plant, scene_graph, body, pads) for body in bodies}
+    return {name: found for name, found in pieces.items() if found}

@@ -29,7 +29,7 @@ class HingeMoment(LeafSystem):
         self.DeclareVectorOutputPort("components", 2, self._calc_components)
 
     def _eval(self, context: Context) -> np.ndarray:
-        # A revolute joint's axis is fixed in its frame; the machine's is the frame's y axis.
+        # The axis is the joint's frame's y axis: `check_machine_file` sees to it.
         force: SpatialForce = self._forces.Eval(context)[self._joint]  # type: ignore[index]
         return force.rotational()[[0, 2]]
 

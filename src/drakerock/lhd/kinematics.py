@@ -16,13 +16,10 @@ from pydrake.multibody.plant import MultibodyPlant
 from scipy.optimize import brentq
 
 from drakerock.errors import InputError
-from drakerock.lhd.linkage import Linkage
 from drakerock.lhd.model import Machine
+from drakerock.lhd.tracing import find_range
 
 Array = np.ndarray
-
-# Distance of the boom angles of the bucket's range [rad]; linear interpolation errs by less than 2 mrad.
-_GRID_STEP = 0.08
 
 
 @dataclass(frozen=True)
@@ -59,7 +56,7 @@ def make_kinematics(plant: MultibodyPlant, machine: Machine) -> Kinematics:
     """Read the machine's kinematics off the finalized plant; the linkage's stops give the ranges.
 
     Raises:
-        InputError: the linkage isn't closed in the reference pose, or toggles before a stop is reached.
+        InputError: the linkage isn't closed in the reference pose, or boom or bucket have no stops (`find_range`).
     """
     context = plant.CreateDefaultContext()
     instance = machine.instance
@@ -89,8 +86,8 @@ def make_kinematics(plant: MultibodyPlant, machine: Machine) -> Kinematics:
         boom_speed=machine.boom.velocity,
         bucket_speed=machine.bucket.velocity,
     )
-    linkage = Linkage(plant, context, instance, machine.loops)
-    table = np.array(_trace_range(kin, linkage, machine))
+    phi_l, phi_b = (float(angle) for angle in calc_joint_angles(kin, 0.0, 0.0))
+    table = find_range(plant, machine, phi_l, phi_b)
     return replace(
         kin,
         phi_l_range=table[[0, -1], 0],
@@ -98,62 +95,6 @@ def make_kinematics(plant: MultibodyPlant, machine: Machine) -> Kinematics:
         phi_b_min=table[:, 1],
         phi_b_max=table[:, 2],
     )
-
-
-def _trace_range(kin: Kinematics, linkage: Linkage, machine: Machine) -> list[tuple[float, float, float]]:
-    """Return rows (phi_l, phi_b at full tilt, phi_b at full dump) from the boom's upper to its lower stop."""
-    phi_l_0, phi_b_0 = (float(angle) for angle in calc_joint_angles(kin, 0.0, 0.0))
-    linkage.reset(phi_l_0, phi_b_0)
-    if not linkage.move(0.0, phi_l_0, phi_b_0) or linkage.calc_margin() < 0:
-        raise InputError(
-            f"{machine.config.model}: the linkage isn't closed within its stops in the reference pose"
-        )
-
-    def calc_margin(phi_l: float, phi_b: float) -> float:
-        if not linkage.move(0.0, phi_l, phi_b):
-            raise InputError(
-                f"{machine.config.model}: the linkage toggles before it meets a stop, "
-                f"near phi_l = {phi_l:.2f}, phi_b = {phi_b:.2f}"
-            )
-        return linkage.calc_margin()
-
-    def find_stop(start: tuple[float, float], direction: tuple[float, float]) -> float:
-        """Return how far one can go from `start` along `direction` to a stop."""
-        far = _GRID_STEP
-        while calc_margin(start[0] + far * direction[0], start[1] + far * direction[1]) > 0:
-            far += _GRID_STEP
-        return float(
-            brentq(
-                lambda s: calc_margin(start[0] + s * direction[0], start[1] + s * direction[1]),
-                far - _GRID_STEP,
-                far,
-                xtol=1e-6,
-            )
-        )
-
-    def make_row(phi_l: float, phi_b: float) -> tuple[float, float, float]:
-        calc_margin(phi_l, phi_b)
-        tilt = phi_b - find_stop((phi_l, phi_b), (0.0, -1.0))
-        calc_margin(phi_l, phi_b)
-        return phi_l, tilt, phi_b + find_stop((phi_l, phi_b), (0.0, 1.0))
-
-    rows = [make_row(phi_l_0, phi_b_0)]
-    for sign in (-1.0, 1.0):
-        row = rows[0] if sign < 0 else rows[-1]
-        while True:
-            # From the middle of the bucket's range, so that the boom's own stop is met first; pitch is kept.
-            middle = (row[0], (row[1] + row[2]) / 2)
-            calc_margin(*middle)
-            step = _GRID_STEP
-            done = calc_margin(middle[0] + sign * step, middle[1] - sign * step) < 0
-            if done:
-                calc_margin(*middle)
-                step = max(find_stop(middle, (sign, -sign)) - 1e-6, 0.0)
-            row = make_row(middle[0] + sign * step, middle[1] - sign * step)
-            rows.insert(0, row) if sign < 0 else rows.append(row)
-            if done:
-                break
-    return rows
 
 
 def calc_pitch(kin: Kinematics, phi_l: ArrayLike, phi_b: ArrayLike) -> Array:
@@ -239,6 +180,9 @@ def calc_reach(kin: Kinematics, slope: float) -> float:
     """Return r_ft [m]: how far up a plane slope [rad] the tip of the level bucket gets.
 
     The front wheels touch the slope's front; measured along the slope from its toe (section 5).
+
+    Raises:
+        InputError: the tip does not meet the slope at any boom angle.
     """
     # Wheel on the floor and against the slope: the toe lies this far ahead of the axle.
     x_toe = kin.wheel_radius * np.tan(slope / 2)
@@ -247,5 +191,8 @@ def calc_reach(kin: Kinematics, slope: float) -> float:
         x, z = calc_tip(kin, 0.0, phi_l, kin.phi_level - phi_l)
         return float(z - (x - x_toe) * np.tan(slope))
 
+    ends = [calc_height_above_slope(float(phi_l)) for phi_l in kin.phi_l_range]
+    if np.prod(ends) > 0:
+        raise InputError(f"the tip of the level bucket does not meet a slope of {np.degrees(slope):.3g} deg")
     phi_l = brentq(calc_height_above_slope, *kin.phi_l_range)
     return float((calc_tip(kin, 0.0, phi_l, kin.phi_level - phi_l)[0] - x_toe) / np.cos(slope))

@@ -1,4 +1,4 @@
-"""The closed loops behind boom, bucket and articulation: reading, closing and measuring them.
+"""The closed loops behind boom, bucket and articulation: closing and measuring them.
 
 In a machine's reference pose (level on the floor, straight, the bucket level on the floor) every passive
 joint (cylinders, rods, cranks) is at 0 and the loops are closed; from there they are followed step by step.
@@ -6,17 +6,13 @@ joint (cylinders, rods, cranks) is at 0 and the loops are closed; from there the
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
-from dataclasses import dataclass
-from pathlib import Path
-
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable, Joint, ModelInstanceIndex
 from pydrake.systems.framework import Context
 
-from drakerock.errors import InputError
 from drakerock.lhd import names
+from drakerock.lhd.model_file import Loop
 
 Array = np.ndarray
 
@@ -24,35 +20,6 @@ Array = np.ndarray
 _TOLERANCE = 1e-6
 _MAX_ITERATIONS = 12
 _MAX_STEP = 0.15
-
-
-@dataclass(frozen=True)
-class Loop:
-    """A closed loop: point `p_AP` of `body_A` stays on `p_BQ` of `body_B` [m, in the bodies' frames]."""
-
-    body_A: str
-    p_AP: tuple[float, ...]
-    body_B: str
-    p_BQ: tuple[float, ...]
-
-
-def read_loops(file: str | Path) -> tuple[Loop, ...]:
-    """Return the loops that the SDFormat file closes by `drake:ball_constraint` (the plant doesn't tell)."""
-    prefix = "{drake.mit.edu}ball_constraint"
-
-    def read(element: ET.Element, key: str) -> str:
-        found = element.find(f"{prefix}_{key}")
-        if found is None or not found.text:
-            raise InputError(f"{file}: a drake:ball_constraint has no drake:ball_constraint_{key}")
-        return found.text.strip()
-
-    def numbers(text: str) -> tuple[float, ...]:
-        return tuple(float(value) for value in text.split())
-
-    return tuple(
-        Loop(read(e, "body_A"), numbers(read(e, "p_AP")), read(e, "body_B"), numbers(read(e, "p_BQ")))
-        for e in ET.parse(file).getroot().iter(prefix)
-    )
 
 
 def find_passive_joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Joint]:
@@ -97,8 +64,9 @@ class Linkage:
         self._plant.SetPositions(self._context, q)
 
     def move(self, articulation: float, phi_l: float, phi_b: float) -> bool:
-        """Move to these angles [rad] with the loops closed; False where they can't be (state undefined)."""
-        start = self._plant.GetPositions(self._context)[self._driven]
+        """Move to these angles [rad] with the loops closed; False where they can't be (nothing is moved then)."""
+        before = self._plant.GetPositions(self._context).copy()
+        start = before[self._driven]
         target = np.array([articulation, phi_l, phi_b])
         steps = max(1, int(np.ceil(np.abs(target - start).max() / _MAX_STEP)))
         for k in range(1, steps + 1):
@@ -106,6 +74,7 @@ class Linkage:
             q[self._driven] = start + (target - start) * k / steps
             self._plant.SetPositions(self._context, q)
             if not self._close():
+                self._plant.SetPositions(self._context, before)
                 return False
         return True
 

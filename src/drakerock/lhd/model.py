@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cache
 
 import numpy as np
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 
 from drakerock.errors import InputError
 from drakerock.lhd import names
 from drakerock.lhd.config import MachineConfig, MotorConfig
-from drakerock.lhd.linkage import Loop, read_loops
-from drakerock.resources import find_data
+from drakerock.lhd.model_file import Loop, check_machine_file, parse_machine
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,7 @@ class Machine:
         wheel, boom, bucket: limits of one wheel's, the boom's and the bucket's motor.
         steering_angle: angle held at the articulation [rad].
         loops: the linkage's closed loops.
+        ignored: what stands in its file without any effect, a line each.
     """
 
     instance: ModelInstanceIndex
@@ -45,6 +45,7 @@ class Machine:
     bucket: MotorLimits
     steering_angle: float
     loops: tuple[Loop, ...]
+    ignored: tuple[str, ...]
 
 
 def add_machine(plant: MultibodyPlant, config: MachineConfig) -> Machine:
@@ -54,14 +55,12 @@ def add_machine(plant: MultibodyPlant, config: MachineConfig) -> Machine:
     discrete solver treats them implicitly. The articulation's actuator holds the steering angle.
 
     Raises:
-        InputError: no such file, an SDFormat error, or a name of `names` that is missing.
+        InputError: no such file, or something in it that cannot be used (`check_machine_file`).
     """
-    instance, loops = _parse(plant, config.model)
-    _require_names(plant, instance, config.model)
+    file = check_machine_file(config)
+    instance, _ = parse_machine(plant, file.path, config.model)
+    _warn_of(file.ignored)
 
-    for name in ("articulation", "boom_joint", "bucket_joint", *names.WHEEL_JOINTS):
-        if not plant.HasJointActuatorNamed(name, instance):
-            raise InputError(f"{config.model}: joint '{name}' has no actuator (effort limit 0)")
     wheels = [_apply_motor(plant, instance, j, config.wheel, config) for j in names.WHEEL_JOINTS]
     steering_angle = math.radians(config.steering_angle_deg)
     articulation = plant.GetJointByName("articulation", instance)
@@ -78,7 +77,8 @@ def add_machine(plant: MultibodyPlant, config: MachineConfig) -> Machine:
         boom=_apply_motor(plant, instance, "boom_joint", config.boom, config),
         bucket=_apply_motor(plant, instance, "bucket_joint", config.bucket, config),
         steering_angle=steering_angle,
-        loops=loops,
+        loops=file.loops,
+        ignored=file.ignored,
     )
 
 
@@ -109,30 +109,11 @@ def calc_motor_targets(
     return np.array(positions + [rates.get(name, wheel) for name in joints])
 
 
-def _parse(plant: MultibodyPlant, model: str) -> tuple[ModelInstanceIndex, tuple[Loop, ...]]:
-    parser = Parser(plant)
-    parser.package_map().AddPackageXml(str(find_data("models", "package.xml")))
-    try:
-        file = parser.package_map().ResolveUrl(model) if model.startswith("package://") else model
-        if not Path(file).is_file():
-            raise InputError(f"machine.model: {model}: no such file")
-        found = parser.AddModels(file)
-    except RuntimeError as error:
-        raise InputError(f"machine.model: {model}: {error}") from None
-    if len(found) != 1:
-        raise InputError(f"machine.model: {model}: expected one <model>, found {len(found)}")
-    return found[0], read_loops(file)
-
-
-def _require_names(plant: MultibodyPlant, instance: ModelInstanceIndex, model: str) -> None:
-    wanted = [
-        ("link", names.BODIES, plant.HasBodyNamed),
-        ("joint", names.JOINTS, plant.HasJointNamed),
-        ("frame", (*names.FRAMES, f"{names.PROFILE}0"), plant.HasFrameNamed),
-    ]
-    missing = [f"{kind} '{name}'" for kind, group, has in wanted for name in group if not has(name, instance)]
-    if missing:
-        raise InputError(f"machine.model: {model}: missing {', '.join(missing)}")
+@cache
+def _warn_of(lines: tuple[str, ...]) -> None:
+    """Tell once a process."""
+    for line in lines:
+        logging.getLogger("drakerock").warning(line)
 
 
 def _apply_motor(
@@ -144,9 +125,7 @@ def _apply_motor(
         actuator.set_effort_limit(motor.effort)
     damping = config.motor_damping
     if damping is None:
-        if not actuator.has_controller():
-            raise InputError(f"machine.model: {config.model}: joint '{name}' has no drake:controller_gains")
         damping = actuator.get_controller_gains().d
     actuator.set_controller_gains(PdControllerGains(p=0.0, d=damping))
-    velocity = float(joint.velocity_upper_limit()) if motor.velocity is None else motor.velocity
+    velocity = float(joint.velocity_upper_limits()[0]) if motor.velocity is None else motor.velocity
     return MotorLimits(float(actuator.effort_limit()), velocity)

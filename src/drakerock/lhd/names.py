@@ -19,6 +19,14 @@ WHEEL_JOINTS = tuple(f"{wheel}_joint" for wheel in WHEELS)
 JOINTS = ("articulation", "boom_joint", "bucket_joint", *WHEEL_JOINTS)
 """Actuated joints. Positions of boom_joint and bucket_joint are the method's phi_l and phi_b."""
 
+HINGES = {
+    "articulation": ("", "rear_unit"),
+    "boom_joint": ("front_unit", "boom"),
+    "bucket_joint": ("boom", "bucket"),
+    **{joint: ("", wheel) for joint, wheel in zip(WHEEL_JOINTS, WHEELS, strict=True)},
+}
+"""Parent (empty: any) and child of the actuated joints."""
+
 FRAMES = ("floor", "tip")
 """floor: on front_unit, below the front axle's middle at the undeflected tyres' lowest point. tip: on the
 bucket, the middle of the lip's edge."""

@@ -55,6 +55,8 @@ class SensingConfig(Config):
 class PlanningConfig(Config):
     """The dig plan's limits and speeds."""
 
+    file_fields = ("source",)
+
     source: Annotated[str | None, Field(description="a stored plan.json to execute instead of planning")] = (
         None
     )
@@ -116,6 +118,31 @@ class PerformanceConfig(Config):
     event_time: Annotated[float, Field(ge=0, description="shortest stall or slip that counts [s]")] = 0.2
 
 
+class PartConfig(Config):
+    """A part of one's own in place of ours."""
+
+    file_fields = ("system",)
+
+    system: Annotated[
+        str | None,
+        Field(
+            pattern=r"^[\w./-]+:\w+$",
+            description="module:function or file.py:function that makes it; null: ours",
+        ),
+    ] = None
+    parameters: dict[str, float | int | bool | str] = Field(
+        default={}, description="what the function gets by name; numbers can be a study's variables"
+    )
+
+
+class PartsConfig(Config):
+    """Controller, planner and sensor of one's own (`drakerock.loading.parts`)."""
+
+    controller: PartConfig = PartConfig()
+    planner: PartConfig = PartConfig()
+    sensor: PartConfig = PartConfig()
+
+
 class LoadingConfig(Config):
     """Everything about one loading cycle but machine, site and rocks."""
 
@@ -124,3 +151,4 @@ class LoadingConfig(Config):
     planning: PlanningConfig = PlanningConfig()
     control: ControlConfig = ControlConfig()
     performance: PerformanceConfig = PerformanceConfig()
+    parts: PartsConfig = PartsConfig()

@@ -400,8 +400,11 @@ def _assemble(
     )
 
 
+NOT_INITIALISED = "not initialised"
+
+
 class DigPlanner(LeafSystem):
-    """Plans once, when the Diagram is initialised, from what the sensor sees then, or takes a stored plan.
+    """Plans once, when its context is first initialised, from what the sensor sees then, or takes a stored plan.
 
     Input port:
         ``height_field``: abstract, a `HeightField` in W.
@@ -427,12 +430,13 @@ class DigPlanner(LeafSystem):
         self._stored = stored
         empty = HeightField(np.zeros(0), np.zeros(0), np.zeros((0, 0)), sensing.cell)
         self._field = self.DeclareAbstractInputPort("height_field", AbstractValue.Make(empty))
-        self._plan = self.DeclareAbstractState(AbstractValue.Make(NoPlan("not initialised")))
+        self._plan = self.DeclareAbstractState(AbstractValue.Make(NoPlan(NOT_INITIALISED)))
         self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)
         self.DeclareStateOutputPort("plan", self._plan)
 
     def _initialize(self, context: Context, state: State) -> None:
-        plan = self._stored
-        if plan is None:
-            plan = make_dig_plan(self._field.Eval(context), *self._arguments)
-        state.get_mutable_abstract_state(int(self._plan)).set_value(plan)
+        # A plan stands until the context is reset: where the machine stands by now is no reason for another one.
+        held = context.get_abstract_state(int(self._plan)).get_value()
+        if isinstance(held, NoPlan) and held.reason == NOT_INITIALISED:
+            plan = self._stored or make_dig_plan(self._field.Eval(context), *self._arguments)
+            state.get_mutable_abstract_state(int(self._plan)).set_value(plan)

@@ -116,12 +116,12 @@ class Recorder:
         self._last: Array = np.zeros((0, 7))
         self._moves: list[tuple[int, NDArray[np.int64], Array]] = []
 
-    def add(self, time: float, mode: int, body_poses: list[RigidTransform], rock_poses: Array) -> None:
-        """Add a frame: the plant's body poses, and (7 n,) rock poses in W."""
+    def add(self, time: float, mode: int, body_poses: list[RigidTransform], pile: PileState) -> None:
+        """Add a frame: the plant's body poses, and where the rocks are."""
         self._times.append(time)
         self._modes.append(mode)
         self._bodies.append(np.array([_to_vector(body_poses[int(index)]) for index in self._indices]))
-        poses = rock_poses.reshape(-1, 7).copy()
+        poses = np.hstack([pile.q_WRs, pile.p_WRs])
         if self._first is None:
             self._first = self._last = poses
             return

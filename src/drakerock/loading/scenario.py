@@ -12,10 +12,8 @@ from drakerock.config import Config, load_config
 from drakerock.lhd.config import MachineConfig
 from drakerock.loading.config import LoadingConfig
 from drakerock.resources import find_data
-from drakerock.rocks.config import PileConfig, RocksConfig, SiteConfig
+from drakerock.rocks.config import PileConfig, PileRecipe, RocksConfig, SiteConfig
 from drakerock.rocks.engine.config import DynamicsConfig
-from drakerock.rocks.making.emission import make_emitter
-from drakerock.rocks.making.settling import PileRecipe
 
 
 class RecordingConfig(Config):
@@ -41,7 +39,7 @@ class Scenario(Config):
 
     @model_validator(mode="after")
     def _check_emitter(self) -> Scenario:
-        top = float(make_emitter(self.site, self.pile).high[2])
+        top = self.pile.emission_top
         roof = self.site.drift_height - self.site.roof_sag
         if self.pile.emission_reach > 0 and top > roof:
             raise ValueError(

@@ -6,7 +6,7 @@ import hashlib
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue
+from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, LeafSystem
@@ -16,12 +16,13 @@ from scipy.stats import binned_statistic_2d
 from drakerock.errors import InputError
 from drakerock.loading.config import ScannerConfig, SensingConfig
 from drakerock.loading.field import HeightField
+from drakerock.memory import weak
 from drakerock.randomness import make_generator
 from drakerock.rocks.config import SiteConfig
 from drakerock.rocks.geometry import cast_rays, make_pile_mesh
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.site import calc_roof_height
-from drakerock.rocks.state import PileState
+from drakerock.rocks.state import PileState, make_empty_pile
 
 Array = NDArray[np.float64]
 
@@ -138,7 +139,7 @@ class PileSensor(LeafSystem):
     """Sees the pile as a height field: ideal, or estimated from a scan with a scanner on the machine.
 
     Input ports:
-        ``rock_poses``: (7 n,) per rock the quaternion (w, x, y, z) and position in W [m].
+        ``pile``: abstract, the rocks as a `PileState`.
         ``body_poses``: only with a scanner; list of RigidTransform, the plant's output.
 
     Output port:
@@ -148,7 +149,6 @@ class PileSensor(LeafSystem):
 
     def __init__(
         self,
-        pile: PileState,
         shapes: tuple[RockShape, ...],
         site: SiteConfig,
         config: SensingConfig,
@@ -160,7 +160,6 @@ class PileSensor(LeafSystem):
         """Make the sensor.
 
         Args:
-            pile: the rocks (shapes and sizes; the poses come by the port).
             shapes: the rock shapes.
             site: the drift.
             config: which sensor, and its settings.
@@ -173,15 +172,14 @@ class PileSensor(LeafSystem):
         """
         super().__init__()
         self.set_name("pile_sensor")
-        self._pile = pile
         self._shapes = shapes
         self._site = site
         self._config = config
         self._length = length
         self._seed = seed
         self._front_unit = front_unit
-        self._rock_poses = self.DeclareVectorInputPort("rock_poses", 7 * len(pile))
-        inputs = {self._rock_poses.ticket()}
+        self._pile = self.DeclareAbstractInputPort("pile", Value[object](make_empty_pile()))
+        inputs = {self._pile.ticket()}
         if config.kind == "scanner":
             if front_unit is None:
                 raise InputError("loading.sensing.kind: a scanner needs the front unit that carries it")
@@ -193,25 +191,18 @@ class PileSensor(LeafSystem):
         self.DeclareAbstractOutputPort(
             "height_field",
             lambda: AbstractValue.Make(empty),
-            self._calc_height_field,
+            weak(self._calc_height_field),
             prerequisites_of_calc=inputs,
         )
 
     def _calc_height_field(self, context: Context, output: AbstractValue) -> None:
-        poses = self._rock_poses.Eval(context).reshape(-1, 7)
-        pile = PileState(
-            p_WRs=poses[:, 4:],
-            q_WRs=poses[:, :4],
-            V_WRs=np.zeros((len(poses), 6)),
-            shape=self._pile.shape,
-            size=self._pile.size,
-            fixed=self._pile.fixed,
-        )
+        pile: PileState = self._pile.Eval(context)
         if self._config.kind == "ideal":
             field = calc_height_field(pile, self._shapes, self._site, self._config.cell, self._length)
         else:
             X_WF = self._body_poses.Eval(context)[int(self._front_unit)]  # type: ignore[arg-type]
-            scene = hashlib.sha256(np.ascontiguousarray(poses).tobytes()).hexdigest()
+            poses = np.hstack([pile.q_WRs, pile.p_WRs])
+            scene = hashlib.sha256(poses.tobytes()).hexdigest()
             rng = make_generator(self._seed, "scanner", scene)
             points = calc_scan(pile, self._shapes, self._config.scanner, X_WF, rng)
             field = estimate_height_field(points, self._site, self._config.cell, self._length)

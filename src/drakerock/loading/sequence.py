@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from drakerock.config import calc_config_hash
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.files import make_folder
-from drakerock.loading.cycle import CycleOutcome, CycleResult, run_cycle, save_cycle
+from drakerock.identity import calc_config_hash, get_versions
+from drakerock.loading.cycle import CycleResult, run_cycle, save_cycle
+from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario, make_recipe
+from drakerock.memory import free_diagrams
 from drakerock.randomness import make_generator
 from drakerock.rocks.making.settling import fetch_pile, refill
 from drakerock.rocks.shapes import load_rock_shapes
@@ -84,7 +86,16 @@ def _read_loading(place: Path, identity: str) -> tuple[CycleOutcome, PileState] 
         raise InputError(
             f"{path}: of another scenario ({outcome.scenario_hash}, not {identity}); take another folder"
         )
+    if outcome.versions != get_versions():
+        raise InputError(
+            f"{path}: made by other versions ({_show(outcome.versions)}, not {_show(get_versions())}); take another "
+            "folder"
+        )
     return outcome, load_pile(place / NEXT_PILE)
+
+
+def _show(versions: dict[str, str]) -> str:
+    return " ".join(f"{name} {number}" for name, number in versions.items())
 
 
 def _run_loading(
@@ -95,6 +106,7 @@ def _run_loading(
             progress(number, stage, time)
 
     result = run_cycle(scenario, pile, lambda mode, time: tell(mode.lower(), time))
+    free_diagrams()
     tell("refill", result.outcome.sim_time_s)
     following = make_next_pile(scenario, result, number)
     make_folder(place)

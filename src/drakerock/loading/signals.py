@@ -43,11 +43,10 @@ def calc_signals(station: Station, root_context: Context) -> tuple[dict[str, Arr
         data["motor_speeds"],
     )
     add({"hinge_moment": "N m"}, data["hinge_moment"])
-    if station.scenario.dynamics.rocks == "nonsmooth":
-        # That engine reports on the step taken last; a row holds the step that begins.
-        for name in ("F_B_W", "rock_summary"):
-            data[name] = np.concatenate([data[name][:, 1:], data[name][:, -1:]], axis=1)
-    add(dict.fromkeys(FORCE_NAMES[:3], "N m") | dict.fromkeys(FORCE_NAMES[3:], "N"), data["F_B_W"])
+    # Rocks report on the step that ended; a row holds the step that begins.
+    for name in ("bucket_force", "rock_summary"):
+        data[name] = np.concatenate([data[name][:, 1:], data[name][:, -1:]], axis=1)
+    add(dict.fromkeys(FORCE_NAMES[:3], "N m") | dict.fromkeys(FORCE_NAMES[3:], "N"), data["bucket_force"])
     add(ROCK_SUMMARY, data["rock_summary"])
 
     plant, instance = station.plant, station.machine.instance

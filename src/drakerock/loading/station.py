@@ -1,14 +1,23 @@
-"""The station: machine, site, rocks, sensor, planner and controller wired into one Diagram. The only wiring."""
+"""The station: machine, drift, rocks, sensor, planner and controller wired into one Diagram. The only wiring."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    Diagram,
+    DiagramBuilder,
+    LeafSystem,
+    OutputPort,
+    System,
+)
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
 from drakerock.lhd.geometry import collision_pieces, make_bucket_geometry
@@ -16,15 +25,21 @@ from drakerock.lhd.hinge import add_hinge_moment
 from drakerock.lhd.kinematics import make_kinematics
 from drakerock.lhd.measurement import add_machine_sensor
 from drakerock.lhd.model import Machine, add_machine, calc_motor_targets
+from drakerock.lhd.placement import set_machine_pose
+from drakerock.lhd.rocks import add_lhd_rocks
 from drakerock.loading.control import FeedforwardController
+from drakerock.loading.field import HeightField
+from drakerock.loading.parts import MakePart, StationView, connect_inputs, make_part
+from drakerock.loading.plan import DigPlan
 from drakerock.loading.plan_file import load_plan
 from drakerock.loading.planning import DiggingMachine, DigPlanner
 from drakerock.loading.scenario import Scenario
+from drakerock.loading.segments import SegmentTracker
 from drakerock.loading.sensing import PileSensor
-from drakerock.rocks.drake.assembly import add_plant, add_site
+from drakerock.rocks.drake.drift import AddDrift
 from drakerock.rocks.drake.interface import RockSystem
-from drakerock.rocks.drake.plant_engine import PlantRocks, add_plant_rocks, add_rock_bodies
-from drakerock.rocks.drake.system import NonsmoothRocks, add_nonsmooth_rocks
+from drakerock.rocks.drake.plant import add_plant
+from drakerock.rocks.drake.plant_engine import AddRockBodies
 from drakerock.rocks.shapes import RockShape, load_rock_shapes
 from drakerock.rocks.site import Site, make_site
 from drakerock.rocks.state import PileState
@@ -34,19 +49,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Station:
-    """A built Diagram and its parts.
+    """A built Diagram and its parts; `initialize` puts a context of it to the start of a loading.
 
     Attributes:
         diagram: everything, ready for a Simulator. Its exported ports are ``measurement``, ``plan``,
-            ``height_field``, ``mode``, ``progress`` and ``rock_poses``.
+            ``height_field``, ``mode``, ``progress``, ``motor_speeds``, ``pile``, ``bucket_force``.
         scenario: what it was made from.
         plant, scene_graph: Drake's.
         site: the drift.
         machine: the machine's names and limits in the plant.
         digger: its kinematics and bucket.
         shapes: the rock shapes.
-        rocks: the rock engine's system (`RockSystem`).
-        pile_sensor, planner, controller: the loading systems.
+        rocks: the rocks' system.
+        sensor, planner, controller, tracker: the loading systems.
         logs: one per-step log by name of the quantity.
     """
 
@@ -59,10 +74,46 @@ class Station:
     digger: DiggingMachine
     shapes: tuple[RockShape, ...]
     rocks: RockSystem
-    pile_sensor: PileSensor
-    planner: DigPlanner
-    controller: FeedforwardController
+    sensor: System
+    planner: System
+    controller: System
+    tracker: System
     logs: dict[str, VectorLogSink]
+
+    def initialize(self, root_context: Context) -> HeightField:
+        """Put a context of the Diagram to the start of a loading: pile looked at, plan made, machine placed.
+
+        Sensing and planning come first, since they tell where the machine starts; only a scanner's view depends on
+        where it stands meanwhile. A Simulator's own initialisation afterwards keeps the plan.
+
+        Returns:
+            What was seen.
+
+        Raises:
+            InputError: the machine cannot reach its starting pose.
+        """
+        loading = self.scenario.loading
+        root_context.SetTimeStateAndParametersFrom(self.diagram.CreateDefaultContext())
+        self.rocks.set_pile(root_context, self.rocks.pile)
+        self._place(root_context, x_tip=-loading.sensing.scanner.distance, y=0.0)
+        for part in (self.sensor, self.planner):
+            part.ExecuteInitializationEvents(part.GetMyMutableContextFromRoot(root_context))
+        field: HeightField = self.diagram.GetOutputPort("height_field").Eval(root_context)
+        plan = self.diagram.GetOutputPort("plan").Eval(root_context)
+        if isinstance(plan, DigPlan):
+            self._place(root_context, x_tip=float(plan.waypoint_x[0]) - loading.planning.run_up, y=plan.y)
+        return field
+
+    def _place(self, root_context: Context, x_tip: float, y: float) -> None:
+        set_machine_pose(
+            self.plant,
+            self.plant.GetMyMutableContextFromRoot(root_context),
+            self.machine,
+            x_tip=x_tip,
+            y=y,
+            z_tip=self.scenario.loading.planning.floor_clearance,
+            kin=self.digger.kinematics,
+        )
 
 
 class MotorTargets(LeafSystem):
@@ -85,107 +136,165 @@ class MotorTargets(LeafSystem):
         output.SetFromVector(calc_motor_targets(self._plant, self._machine, *self._speeds.Eval(context)))
 
 
-def make_station(scenario: Scenario, pile: PileState) -> Station:
+def make_station(
+    scenario: Scenario,
+    pile: PileState,
+    controller: MakePart | None = None,
+    planner: MakePart | None = None,
+    sensor: MakePart | None = None,
+    *,
+    visible: bool = True,
+    extend: Callable[[DiagramBuilder, StationView], None] | None = None,
+) -> Station:
     """Build the Diagram of one loading cycle.
 
     Args:
         scenario: the whole configuration.
-        pile: the rocks; their poses are written into a context by ``station.rocks.set_pile``.
+        pile: the rocks.
+        controller, planner, sensor: make a part from a `StationView` (see `drakerock.loading.parts`); default: what the
+            scenario names in `loading.parts`, or ours. Their input ports are connected by name to the station's
+            signals: measurement, plan, height_field, mode, progress, bucket_force, hinge_moment, pile, body_poses,
+            body_spatial_velocities, machine_state, geometry_query, rock_summary.
+        visible: show rocks to SceneGraph, for Meshcat and cameras.
+        extend: called with the builder before the Diagram is built, to add what else is wanted (a visualizer).
 
     Raises:
-        InputError: the machine's SDFormat file, a rock mesh or a stored plan cannot be used.
+        InputError: the machine's SDFormat file, a rock mesh, a stored plan or a part cannot be used.
     """
     dynamics, loading = scenario.dynamics, scenario.loading
-    shapes = load_rock_shapes(scenario.rocks.shapes)
     site = make_site(scenario.site)
-
     builder = DiagramBuilder()
     plant, scene_graph = add_plant(builder, dynamics)
-    add_site(plant, site, dynamics)
+    AddDrift(plant, site, dynamics.plant)
     machine = add_machine(plant, scenario.machine)
-    rocks: PlantRocks | NonsmoothRocks
-    motor_inputs = []
+    shapes = load_rock_shapes(scenario.rocks.shapes)
+    bodies = None
     if dynamics.rocks == "plant":
-        geometries = add_rock_bodies(plant, pile, shapes, scenario.rocks, dynamics)
-        plant.Finalize()
-        rocks = add_plant_rocks(builder, plant, pile, geometries)
-    else:
-        plant.Finalize()
-        rocks, view = add_nonsmooth_rocks(
-            builder, plant, scene_graph, machine, site, shapes, scenario.rocks, dynamics, pile
+        bodies = AddRockBodies(
+            plant, pile, scenario.rocks, dynamics.plant, dynamics.reference_overlap, shapes
         )
-        motor_inputs.append(view.GetInputPort("desired_state"))
-    motor_inputs.append(plant.get_desired_state_input_port(machine.instance))
-
-    kinematics = make_kinematics(plant, machine)
+    plant.Finalize()
     digger = DiggingMachine(
-        kinematics,
+        make_kinematics(plant, machine),
         make_bucket_geometry(plant, scene_graph, machine),
         _calc_machine_width(plant, scene_graph, machine),
     )
-    machine_sensor = add_machine_sensor(builder, plant, machine, kinematics)
-    pile_sensor = builder.AddSystem(
-        PileSensor(
-            pile,
-            shapes,
-            scenario.site,
-            loading.sensing,
-            scenario.site.drift_length / 2,
-            seed=scenario.seed,
-            front_unit=plant.GetBodyByName("front_unit", machine.instance).index(),
-        )
-    )
-    if loading.sensing.kind == "scanner":
-        builder.Connect(plant.get_body_poses_output_port(), pile_sensor.GetInputPort("body_poses"))
-    builder.Connect(rocks.GetOutputPort("rock_poses"), pile_sensor.GetInputPort("rock_poses"))
-    source = loading.planning.source
-    planner = builder.AddSystem(
-        DigPlanner(
-            loading.strategy,
-            digger,
-            loading.planning,
-            loading.sensing,
-            scenario.site.drift_width,
-            loading.control.speed_floor,
-            stored=None if source is None else load_plan(source)[0],
-        )
-    )
-    builder.Connect(pile_sensor.GetOutputPort("height_field"), planner.GetInputPort("height_field"))
-    controller = builder.AddSystem(FeedforwardController(kinematics, loading.control, dynamics.time_step))
-    builder.Connect(planner.GetOutputPort("plan"), controller.GetInputPort("plan"))
-    builder.Connect(machine_sensor.GetOutputPort("measurement"), controller.GetInputPort("measurement"))
+    bucket = plant.GetBodyByName("bucket", machine.instance).index()
+
     motors = builder.AddSystem(MotorTargets(plant, machine))
-    builder.Connect(controller.GetOutputPort("motor_speeds"), motors.GetInputPort("motor_speeds"))
-    for port in motor_inputs:
-        builder.Connect(motors.GetOutputPort("desired_state"), port)
+    builder.Connect(
+        motors.GetOutputPort("desired_state"), plant.get_desired_state_input_port(machine.instance)
+    )
+    rocks = add_lhd_rocks(
+        builder, plant, scene_graph, machine, pile, scenario.rocks, dynamics, scenario.site,
+        shapes=shapes, bodies=bodies, visible=visible,
+    )  # fmt: skip
+    machine_sensor = add_machine_sensor(builder, plant, machine, digger.kinematics)
     hinge = add_hinge_moment(builder, plant, machine)
 
-    logged = {
+    view = StationView(scenario, plant, scene_graph, machine, digger, shapes)
+    parts = loading.parts
+    sensor_system = builder.AddSystem(
+        make_part("sensor", sensor, parts.sensor, view, lambda: _make_sensor(view))
+    )
+    planner_system = builder.AddSystem(
+        make_part("planner", planner, parts.planner, view, lambda: _make_planner(view))
+    )
+    controller_system = builder.AddSystem(
+        make_part(
+            "controller", controller, parts.controller, view, lambda: FeedforwardController(digger.kinematics)
+        )
+    )
+    tracker = controller_system
+    if not controller_system.HasOutputPort("progress"):
+        tracker = builder.AddSystem(SegmentTracker(digger.kinematics, loading.control, plant.time_step()))
+    signals: dict[str, OutputPort] = {
         "measurement": machine_sensor.GetOutputPort("measurement"),
-        "motor_speeds": controller.GetOutputPort("motor_speeds"),
-        "mode": controller.GetOutputPort("mode"),
-        "torques": plant.get_net_actuation_output_port(machine.instance),
-        "machine_state": plant.get_state_output_port(machine.instance),
+        "height_field": sensor_system.GetOutputPort("height_field"),
+        "plan": planner_system.GetOutputPort("plan"),
+        "mode": tracker.GetOutputPort("mode"),
+        "progress": tracker.GetOutputPort("progress"),
+        "bucket_force": rocks.get_body_force_output_port(bucket),
         "hinge_moment": hinge.GetOutputPort("moment"),
-        "F_B_W": rocks.GetOutputPort("F_B_W"),
-        "rock_summary": rocks.GetOutputPort("rock_summary"),
+        "pile": rocks.GetOutputPort("pile"),
+        "rock_summary": rocks.GetOutputPort("summary"),
+        "body_poses": plant.get_body_poses_output_port(),
+        "body_spatial_velocities": plant.get_body_spatial_velocities_output_port(),
+        "machine_state": plant.get_state_output_port(machine.instance),
+        "geometry_query": scene_graph.get_query_output_port(),
+    }
+    connect_inputs(builder, "sensor", sensor_system, signals)
+    connect_inputs(builder, "planner", planner_system, signals)
+    connect_inputs(builder, "controller", controller_system, signals)
+    if tracker is not controller_system:
+        connect_inputs(builder, "tracker", tracker, signals)
+    motor_speeds = controller_system.GetOutputPort("motor_speeds")
+    builder.Connect(motor_speeds, motors.GetInputPort("motor_speeds"))
+
+    signals |= {
+        "motor_speeds": motor_speeds,
+        "torques": plant.get_net_actuation_output_port(machine.instance),
     }
     logs = {}
-    for name, port in logged.items():
-        logs[name] = LogVectorOutput(port, builder, dynamics.time_step)
+    for name in LOGGED:
+        logs[name] = LogVectorOutput(signals[name], builder, plant.time_step())
         logs[name].set_name(f"log_{name}")
-    builder.ExportOutput(machine_sensor.GetOutputPort("measurement"), "measurement")
-    builder.ExportOutput(planner.GetOutputPort("plan"), "plan")
-    builder.ExportOutput(pile_sensor.GetOutputPort("height_field"), "height_field")
-    builder.ExportOutput(controller.GetOutputPort("mode"), "mode")
-    builder.ExportOutput(controller.GetOutputPort("progress"), "progress")
-    builder.ExportOutput(rocks.GetOutputPort("rock_poses"), "rock_poses")
+    for name in EXPORTED:
+        builder.ExportOutput(signals[name], name)
+    if extend:
+        extend(builder, view)
     diagram = builder.Build()
     diagram.set_name("station")
     return Station(
-        diagram, scenario, plant, scene_graph, site, machine, digger, shapes, rocks,
-        pile_sensor, planner, controller, logs,
-    )  # fmt: skip
+        diagram=diagram,
+        scenario=scenario,
+        plant=plant,
+        scene_graph=scene_graph,
+        site=site,
+        machine=machine,
+        digger=digger,
+        shapes=shapes,
+        rocks=rocks,
+        sensor=sensor_system,
+        planner=planner_system,
+        controller=controller_system,
+        tracker=tracker,
+        logs=logs,
+    )
+
+
+LOGGED = (
+    "measurement", "motor_speeds", "mode", "torques", "machine_state", "hinge_moment", "bucket_force", "rock_summary",
+)  # fmt: skip
+"""Signals that are logged in every step."""
+EXPORTED = ("measurement", "plan", "height_field", "mode", "progress", "motor_speeds", "pile", "bucket_force")
+"""Signals that are output ports of the station's Diagram."""
+
+
+def _make_sensor(view: StationView) -> PileSensor:
+    scenario = view.scenario
+    return PileSensor(
+        view.shapes,
+        scenario.site,
+        scenario.loading.sensing,
+        scenario.site.drift_length / 2,
+        seed=scenario.seed,
+        front_unit=view.plant.GetBodyByName("front_unit", view.machine.instance).index(),
+    )
+
+
+def _make_planner(view: StationView) -> DigPlanner:
+    loading = view.scenario.loading
+    source = loading.planning.source
+    return DigPlanner(
+        loading.strategy,
+        view.digger,
+        loading.planning,
+        loading.sensing,
+        view.scenario.site.drift_width,
+        loading.control.speed_floor,
+        stored=None if source is None else load_plan(source)[0],
+    )
 
 
 def _calc_machine_width(plant: MultibodyPlant, scene_graph: SceneGraph, machine: Machine) -> float:

@@ -1,4 +1,4 @@
-"""Writes a machine's SDFormat file and meshes: python make_machine.py lhd/design.yaml.
+"""Writes a machine's SDFormat file and meshes beside its design: python make_machine.py lhd/design.yaml.
 
 The design states shapes, pins and masses; this works out what SDFormat wants on top: link poses, inertias
 from the shapes, the cylinders' joint limits, the points of the loop constraints. The package itself reads the
@@ -7,6 +7,7 @@ SDFormat only.
 
 from __future__ import annotations
 
+import argparse
 import math
 import sys
 from pathlib import Path
@@ -14,15 +15,64 @@ from typing import Any
 
 import numpy as np
 import trimesh
-import yaml
+from trimesh import Trimesh as Mesh
 
-Mesh = trimesh.Trimesh
+from drakerock.errors import InputError
+from drakerock.files import read_text
+from drakerock.yaml_reader import YamlDocument
+
+_SIGNATURE = "<!-- Written by make_machine.py from design.yaml: change that, not this. -->"
 
 
-def write_machine(design_file: Path) -> None:
-    """Write <name>.sdf and the OBJ meshes into the folder of `design_file`."""
-    writer = Writer(yaml.safe_load(design_file.read_text()), design_file.parent)
-    writer.write()
+def write_machine(design_file: Path) -> list[Path]:
+    """Write <name>.sdf and the OBJ meshes into the folder of `design_file`; nothing is deleted.
+
+    Returns:
+        The files written.
+
+    Raises:
+        OSError: the design cannot be read or a file not be written.
+        ValueError: the design lacks something, or <name>.sdf is none that this has written.
+    """
+    folder = design_file.parent
+    try:
+        design = YamlDocument(read_text(design_file), str(design_file)).data
+        writer = Writer(design, folder)
+        text = writer.make_model()
+    except KeyError as error:
+        raise ValueError(f"{design_file}: the key {error} is missing") from None
+    except (InputError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise ValueError(f"{design_file}: {error}") from None
+    model = folder / f"{writer.name}.sdf"
+    if model.exists() and _SIGNATURE not in model.read_text(encoding="utf-8"):
+        raise ValueError(
+            f"{model}: not written by make_machine.py, so it stays; move it or change the design's name"
+        )
+    files = {model: text} | {folder / name: mesh for name, mesh in writer.meshes.items()}
+    for path, content in files.items():
+        path.write_text(content, encoding="utf-8")
+    return list(files)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command: 0, or 2 with a message for a design that cannot be used."""
+    parser = argparse.ArgumentParser(
+        description="Write a machine's SDFormat file and its meshes into the folder of its design. Files of these "
+        "names are replaced, nothing is deleted."
+    )
+    parser.add_argument("design", nargs="+", type=Path, help="a design.yaml such as lhd/design.yaml")
+    for design in parser.parse_args(arguments).design:
+        try:
+            files = write_machine(design)
+        except (OSError, ValueError) as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
+        for path in files:
+            print(f"wrote {path}")
+        others = sorted({*design.parent.glob("*.obj"), *design.parent.glob("*.sdf")} - set(files))
+        for path in others:
+            print(f"left {path}: no part of this machine")
+    return 0
 
 
 class Writer:
@@ -30,14 +80,13 @@ class Writer:
 
     def __init__(self, design: dict[str, Any], folder: Path) -> None:
         self.design, self.folder, self.name = design, folder, design["name"]
+        self.meshes: dict[str, str] = {}
         self.lines: list[str] = []
         self.links: list[str] = []
         self.loops: list[str] = []
 
-    def write(self) -> None:
-        """Write the model."""
-        for old in [*self.folder.glob("*.obj"), *self.folder.glob("*.sdf")]:
-            old.unlink()
+    def make_model(self) -> str:
+        """Return the SDFormat text; the meshes' texts are in `meshes`."""
         bodies, motors = self.design["bodies"], self.design["motors"]
         steel = make_proximity(self.design["steel"])
 
@@ -73,10 +122,10 @@ class Writer:
             f'<drake:collision_filter_group name="machine">{members}'
             "<drake:ignored_collision_filter_group>machine</drake:ignored_collision_filter_group></drake:collision_filter_group>"
         )
-        text = "\n".join(
+        return "\n".join(
             [
                 '<?xml version="1.0"?>',
-                "<!-- Written by make_machine.py from design.yaml: change that, not this. -->",
+                _SIGNATURE,
                 '<sdf version="1.11" xmlns:drake="drake.mit.edu">',
                 f'<model name="{self.name}">',
                 *self.lines,
@@ -86,7 +135,6 @@ class Writer:
                 "",
             ]
         )
-        (self.folder / f"{self.name}.sdf").write_text(text)
 
     # -- parts
 
@@ -164,7 +212,7 @@ class Writer:
         X_WC[:3, 3] = start
         shortest, longest = spec["length"]
         if not shortest < length < longest:
-            raise SystemExit(
+            raise ValueError(
                 f"{name}: the reference pose needs {length:.3f} m, the stops are {spec['length']}"
             )
         tube = shortest - 0.12
@@ -286,8 +334,10 @@ class Writer:
         lines += [
             f"f {a + 1}//{i + 1} {b + 1}//{i + 1} {c + 1}//{i + 1}" for i, (a, b, c) in enumerate(flat.faces)
         ]
-        (self.folder / file).write_text("\n".join(lines) + "\n")
-        return f"package://drakerock/{self.name}/{file}"
+        self.meshes[file] = "\n".join(lines) + "\n"
+        # Shipped machines are found by the package, others beside their file.
+        shipped = self.folder.resolve() == Path(__file__).resolve().parent / self.name
+        return f"package://drakerock/{self.name}/{file}" if shipped else file
 
 
 # -- shapes
@@ -376,7 +426,7 @@ def make_transform(p: Any, pitch: float = 0.0) -> np.ndarray:
     """Return the (4, 4) transform of a translation and a rotation about y."""
     X = np.eye(4)
     c, s = math.cos(pitch), math.sin(pitch)
-    X[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    X[:3, :3] = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     X[:3, 3] = p
     return X
 
@@ -420,5 +470,4 @@ def make_proximity(contact: dict[str, float]) -> str:
 
 
 if __name__ == "__main__":
-    for argument in sys.argv[1:]:
-        write_machine(Path(argument))
+    sys.exit(main())

@@ -8,9 +8,14 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from drakerock.config import Config
+from drakerock.rocks.engine.config import DynamicsConfig
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
+
+# Rocks leave the emitter as if they had fallen from 0.5 m above it, so that it clears in time [m/s].
+START_SPEED = 3.0
+GRAVITY = 9.81
 
 
 class SizeClass(Config):
@@ -22,6 +27,8 @@ class SizeClass(Config):
 
 class RocksConfig(Config):
     """The rocks: shapes, gradation, material (method section 3, table)."""
+
+    file_fields = ("shapes",)
 
     shapes: Annotated[
         tuple[str, ...],
@@ -97,6 +104,8 @@ class SiteConfig(Config):
 class PileConfig(Config):
     """How the pile is made: rocks emitted from above and simulated to rest (method section 3)."""
 
+    file_fields = ("source",)
+
     source: Annotated[str | None, Field(description="a stored pile (.npz) to take instead of making one")] = (
         None
     )
@@ -128,3 +137,19 @@ class PileConfig(Config):
         float,
         Field(ge=0, le=0.1, description="rocks nearer than this touch: debris is what touches no pile [m]"),
     ] = 0.005
+
+    @property
+    def emission_top(self) -> float:
+        """Upper side of the emitter [m]; between two batches it empties by their fall."""
+        interval = self.emission_interval
+        return self.emission_height + (START_SPEED * interval + 0.5 * GRAVITY * interval**2)
+
+
+class PileRecipe(Config):
+    """All that a made pile depends on; its hash names the pile in the cache."""
+
+    seed: int
+    site: SiteConfig
+    rocks: RocksConfig
+    pile: PileConfig
+    dynamics: DynamicsConfig

@@ -4,55 +4,40 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import (
-    FramePoseVector,
-    GeometryFrame,
-    GeometryInstance,
-    ProximityProperties,
-    SceneGraph,
-)
-from pydrake.math import RigidTransform
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from drakerock.rocks.drake.assembly import make_convex, make_pose
+from drakerock.rocks.engine.collision.gjk import make_gjk_workspace
+from drakerock.rocks.engine.collision.nearness import find_near_pairs
+from drakerock.rocks.engine.collision.shapes import make_convex_shapes
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.state import PileState
 
 
 def find_contacts(pile: PileState, shapes: tuple[RockShape, ...], gap: float) -> NDArray[np.int64]:
-    """Return the pairs of rocks (m, 2) whose surfaces are nearer than `gap` [m] or overlap."""
+    """Return the pairs of rocks (m, 2) whose surfaces overlap or are at most `gap` [m] apart."""
     if len(pile) < 2:
         return np.zeros((0, 2), np.int64)
     radii = np.array([shape.radius for shape in shapes])[pile.shape] * pile.size
     pairs = cKDTree(pile.p_WRs).query_pairs(2.0 * radii.max() + gap, output_type="ndarray")
     distance = np.linalg.norm(pile.p_WRs[pairs[:, 0]] - pile.p_WRs[pairs[:, 1]], axis=1)
     pairs = pairs[distance <= radii[pairs[:, 0]] + radii[pairs[:, 1]] + gap]
-
-    scene_graph = SceneGraph()
-    source = scene_graph.RegisterSource("rocks")
-    poses, geometries = {}, []
-    for rock in range(len(pile)):
-        frame = scene_graph.RegisterFrame(source, GeometryFrame(f"rock_{rock}"))
-        shape = shapes[pile.shape[rock]]
-        convex = make_convex(shape.vertices, shape.name, float(pile.size[rock]))
-        geometry = GeometryInstance(RigidTransform(), convex, f"rock_{rock}")
-        geometry.set_proximity_properties(ProximityProperties())
-        geometries.append(scene_graph.RegisterGeometry(source, frame, geometry))
-        poses[frame] = make_pose(pile.q_WRs[rock], pile.p_WRs[rock])
-    context = scene_graph.CreateDefaultContext()
-    port = scene_graph.get_source_pose_port(source)
-    vector = FramePoseVector()
-    for frame, pose in poses.items():
-        vector.set_value(frame, pose)
-    port.FixValue(context, vector)
-    query = scene_graph.get_query_output_port().Eval(context)
-    near = [
-        query.ComputeSignedDistancePairClosestPoints(geometries[a], geometries[b]).distance < gap
-        for a, b in pairs
-    ]
-    return pairs[np.array(near, bool)]
+    near = np.zeros(len(pairs), np.bool_)
+    find_near_pairs(
+        # The hulls themselves, without the engine's rounding.
+        make_convex_shapes([shape.vertices for shape in shapes], [0.0] * len(shapes)),
+        np.ascontiguousarray(pile.shape, np.int64),
+        np.ascontiguousarray(pile.size, float),
+        Rotation.from_quat(pile.q_WRs, scalar_first=True).as_matrix(),
+        np.ascontiguousarray(pile.p_WRs, float),
+        pairs,
+        gap,
+        near,
+        make_gjk_workspace(),
+    )
+    return pairs[near]
 
 
 def find_loose(pile: PileState, shapes: tuple[RockShape, ...], gap: float) -> NDArray[np.bool_]:

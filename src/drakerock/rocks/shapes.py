@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import trimesh
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from drakerock.errors import InputError
-from drakerock.resources import find_data
+from drakerock.resources import find_file
 
 Array = NDArray[np.float64]
 
@@ -115,8 +114,7 @@ def load_rock_shapes(uris: tuple[str, ...]) -> tuple[RockShape, ...]:
 
 def _load_rock_shape(uri: str) -> RockShape:
     try:
-        prefix = "package://drakerock/"
-        path = find_data("models", uri.removeprefix(prefix)) if uri.startswith(prefix) else Path(uri)
+        path = find_file(uri)
         mesh = trimesh.load_mesh(path, process=False)
         return make_rock_shape(path.stem, np.asarray(mesh.vertices))
     except FileNotFoundError:

@@ -9,8 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drakerock.rocks.config import SiteConfig
+from drakerock.rocks.engine.surroundings import HalfSpace, StaticPiece, Surroundings
 
 Array = NDArray[np.float64]
+
+# How far outside the site's box a rock still counts as inside [m].
+SITE_MARGIN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,3 +124,22 @@ def _make_taper(config: SiteConfig) -> list[ConvexPiece]:
 def calc_roof_height(config: SiteConfig, y: float | Array) -> float | Array:
     """Return the height of the drift's roof at `y` [m]: a parabola, highest on the centreline."""
     return config.drift_height - config.roof_sag * (np.asarray(y) / (0.5 * config.drift_width)) ** 2
+
+
+def make_surroundings(site: Site) -> Surroundings:
+    """Return the site as the rock engine meets it, without Drake; with it, see `drakerock.rocks.drake.drift`."""
+    config = site.config
+    return Surroundings(
+        tuple(HalfSpace(plane.normal, plane.offset, config.friction) for plane in site.planes),
+        tuple(StaticPiece(piece.vertices, config.friction) for piece in site.pieces),
+        *calc_bounds(config),
+    )
+
+
+def calc_bounds(config: SiteConfig) -> tuple[Array, Array]:
+    """Return the corners (3,) of the box outside of which a rock has left the site [m]."""
+    half = 0.5 * config.drift_width + SITE_MARGIN
+    return (
+        np.array([-config.drift_length, -half, -SITE_MARGIN]),
+        np.array([config.void_depth + SITE_MARGIN, half, config.void_height + 20.0]),
+    )

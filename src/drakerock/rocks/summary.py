@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drakerock.rocks.config import RocksConfig, SiteConfig
+from drakerock.rocks.config import GRAVITY, RocksConfig, SiteConfig
 from drakerock.rocks.geometry import cast_rays, make_pile_mesh
-from drakerock.rocks.making.emission import GRAVITY
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.site import Site
 from drakerock.rocks.state import PileState

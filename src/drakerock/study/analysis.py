@@ -16,7 +16,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from drakerock.errors import InputError
-from drakerock.exploration.analysis import ExplorationConfig, explore
+from drakerock.exploration.analysis import explore
+from drakerock.exploration.config import ExplorationConfig
 from drakerock.exploration.confirmation import Confirmation, Evaluate, confirm_points
 from drakerock.exploration.pareto import pareto_front, parse_bound, select_spread
 from drakerock.exploration.problem import Array, Problem, format_number
@@ -24,7 +25,8 @@ from drakerock.exploration.strategy import Strategy, choose_strategy, parse_weig
 from drakerock.exploration.surrogate import fit_surrogate
 from drakerock.exploration.table import ResponseTable
 from drakerock.files import write_text
-from drakerock.study.store import DATABASE, export_tables
+from drakerock.study.db import DATABASE
+from drakerock.study.tables import export_tables
 
 _CONFIRMATION = "confirmation.json"
 

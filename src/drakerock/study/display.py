@@ -15,7 +15,7 @@ _PLAIN_INTERVAL = 30.0
 
 
 class Display:
-    """Shows a study's status (`Store.read_status`) and messages while it runs.
+    """Shows a study's status (`read_status`) and messages while it runs.
 
     Args:
         console: where; a terminal gets a live table, anything else a line now and then.

@@ -13,18 +13,22 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drakerock.errors import InputError, RunStopped
+from drakerock.errors import DrakerockError, InputError, RunStopped
+from drakerock.study.main_guard import check_main_guard
 from drakerock.study.schema import ExecutorConfig, SlurmConfig
-from drakerock.study.work import Task, TaskResult, run_task
+from drakerock.study.work import Task, TaskResult, count_begun, mark_waiting, run_task
 from drakerock.study.worker_setup import silence_closing
 
 # One thread each: the simulation is sequential, and there is a process for every core.
 THREADS = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 # Dask looks at what its workers do a hundred times a second, and at its event loops fifty times: together a tenth
 # of a core for each worker that is busy with a single task for minutes.
+# A scheduler of ours never tries the task of a dead worker on others by itself: the runner does that, and counts.
+SCHEDULER = {"distributed.scheduler.allowed-failures": 0}
 DASK = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500ms",
@@ -32,8 +36,46 @@ DASK = {
 }
 
 
-class WorkerLost(Exception):
-    """The worker of a task died: killed, out of memory, its machine gone."""
+class WorkerLost(DrakerockError):
+    """The worker of a task died: killed, out of memory, its machine gone.
+
+    Attributes:
+        deaths: workers that died while they ran the task; 0 if it was only waiting for the worker.
+    """
+
+    def __init__(self, message: str, deaths: int = 1) -> None:
+        super().__init__(message)
+        self.deaths = deaths
+
+
+# A sequence that has lost so many times more workers while it only waited for them has failed, too: they die before
+# they begin.
+WAITING_FACTOR = 10
+
+
+@dataclass
+class Losses:
+    """The workers that a sequence has lost on end.
+
+    Attributes:
+        limit: so many that died while they ran it make it fail.
+        deaths: that died while they ran it.
+        waits: that died while it waited for them.
+    """
+
+    limit: int
+    deaths: int = 0
+    waits: int = 0
+
+    def add(self, lost: WorkerLost) -> TaskResult | None:
+        """Count a loss; return the sequence's failure if it is one too many."""
+        self.deaths += lost.deaths
+        self.waits += lost.deaths == 0
+        if self.deaths >= self.limit:
+            return TaskResult("failed", f"{lost}, {self.deaths} times on end")
+        if self.waits >= WAITING_FACTOR * self.limit:
+            return TaskResult("failed", f"{lost}, {self.waits} times before it began")
+        return None
 
 
 Ended = tuple[Task, TaskResult | WorkerLost]
@@ -143,6 +185,7 @@ class DaskExecutor(Executor):
 
     def submit(self, task: Task) -> None:
         """Take in a task."""
+        mark_waiting(task)
         self._futures[self._client.submit(run_task, task, pure=False, retries=0)] = task
 
     def wait(self, timeout: float) -> list[Ended]:
@@ -168,7 +211,9 @@ class DaskExecutor(Executor):
         try:
             result = future.result(timeout=30)
         except KilledWorker:
-            return self._futures.pop(future), WorkerLost("the worker died (killed, or out of memory)")
+            task = self._futures.pop(future)
+            # A scheduler of others may have tried it on several workers before it gave up.
+            return task, WorkerLost("the worker died (killed, or out of memory)", count_begun(task))
         except (CancelledError, FutureCancelledError, OSError, TimeoutError):
             raise RunStopped("the scheduler was lost") from None
         except Exception as error:  # whatever Dask meets; what the work meets is in its result
@@ -230,30 +275,32 @@ def make_slurm_cluster(config: SlurmConfig, folder: Path) -> Any:
         InputError: dask-jobqueue is not installed.
     """
     try:
+        import dask
         from dask_jobqueue import SLURMCluster
     except ImportError:
         raise InputError("executor.kind: slurm needs dask-jobqueue; install drakerock[slurm]") from None
 
-    return SLURMCluster(
-        cores=1,
-        processes=1,
-        memory=config.memory,
-        queue=config.queue,
-        account=config.account,
-        walltime=config.walltime,
-        job_name="drakerock",
-        log_directory=str((folder / "slurm").resolve()),
-        job_extra_directives=list(config.directives),
-        job_script_prologue=[
-            *(f"export {name}={value}" for name, value in THREADS.items()),
-            *(
-                f"export DASK_{key.upper().replace('.', '__').replace('-', '_')}={value}"
-                for key, value in DASK.items()
-            ),
-            *config.prologue,
-        ],
-        scheduler_options={"dashboard_address": ":0"},
-    )
+    with dask.config.set(SCHEDULER):
+        return SLURMCluster(
+            cores=1,
+            processes=1,
+            memory=config.memory,
+            queue=config.queue,
+            account=config.account,
+            walltime=config.walltime,
+            job_name="drakerock",
+            log_directory=str((folder / "slurm").resolve()),
+            job_extra_directives=list(config.directives),
+            job_script_prologue=[
+                *(f"export {name}={value}" for name, value in THREADS.items()),
+                *(
+                    f"export DASK_{key.upper().replace('.', '__').replace('-', '_')}={value}"
+                    for key, value in DASK.items()
+                ),
+                *config.prologue,
+            ],
+            scheduler_options={"dashboard_address": ":0"},
+        )
 
 
 def _connect(address: str) -> DaskExecutor:
@@ -262,17 +309,17 @@ def _connect(address: str) -> DaskExecutor:
     try:
         client = Client(address, timeout=10, name="drakerock")
     except (OSError, TimeoutError, ValueError) as error:
-        raise InputError(f"--scheduler {address}: no Dask scheduler there: {error}") from None
+        raise InputError(f"{address}: no Dask scheduler there: {error}") from None
     return DaskExecutor(f"Dask scheduler {address}", client)
 
 
 def _start_local(workers: int, memory_limit: str) -> DaskExecutor:
+    check_main_guard()
     import dask
     from distributed import LocalCluster
 
     silence_closing()
-    # Dask would silently try the task of a dead worker on three more; the runner does that, and counts.
-    with dask.config.set(DASK | {"distributed.scheduler.allowed-failures": 0}):
+    with dask.config.set(DASK | SCHEDULER):
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,

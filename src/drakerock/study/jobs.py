@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydrake.geometry import Meshcat
 
 from drakerock.exploration.noise import calc_standard_error
 from drakerock.files import make_folder, write_text
-from drakerock.loading.cycle import CycleOutcome, run_cycle, save_cycle
+from drakerock.loading.cycle import run_cycle, save_cycle
+from drakerock.loading.live import make_live_station
+from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.recording import load_recording
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.loading.sequence import run_sequence
@@ -47,6 +50,7 @@ def run_and_save(
     *,
     replay: bool = True,
     figures: bool = False,
+    meshcat: Meshcat | None = None,
 ) -> tuple[CycleOutcome, list[Path]]:
     """Get the pile, run the cycle, write its files and the replay.
 
@@ -56,6 +60,7 @@ def run_and_save(
         progress: called with stage, share in [0, 1] or None, and a note.
         replay: whether to write replay.html.
         figures: whether to write the pictures, too.
+        meshcat: where to show the cycle while it is computed.
 
     Raises:
         InputError: bad configuration, or the folder cannot be written.
@@ -63,8 +68,12 @@ def run_and_save(
     """
     make_folder(folder)
     pile = get_pile(scenario, progress)
+    station = make_live_station(scenario, pile, meshcat) if meshcat else None
     result = run_cycle(
-        scenario, pile, lambda mode, time: progress(mode.lower(), None, note=f"{time:.1f} s simulated")
+        scenario,
+        pile,
+        lambda mode, time: progress(mode.lower(), None, note=f"{time:.1f} s simulated"),
+        station,
     )
     progress("writing", None)
     paths = save_cycle(result, folder)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from drakerock.errors import InputError
 from drakerock.exploration.problem import Objective
-from drakerock.loading.cycle import CycleOutcome
+from drakerock.loading.outcome import CycleOutcome
 
 ObjectiveFunction = Callable[[CycleOutcome], float | None]
 """From the outcome of a finished cycle to the objective in its natural sense; None: no value."""

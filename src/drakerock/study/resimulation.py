@@ -15,10 +15,12 @@ from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.noise import calc_autocorrelation, calc_standard_error
 from drakerock.exploration.problem import Array
 from drakerock.files import make_folder
-from drakerock.study.executors import Executor, WorkerLost, make_executor
+from drakerock.identity import get_versions
+from drakerock.study.db import Store, calc_inputs_hash, read_outcome
+from drakerock.study.executors import Executor, Losses, WorkerLost, make_executor
 from drakerock.study.objectives import get_objective
 from drakerock.study.runner import RUN_SEQUENCE, catch_signals
-from drakerock.study.store import Store, calc_inputs_hash, get_versions, read_outcome
+from drakerock.study.tables import read_loadings
 from drakerock.study.work import Task, TaskResult, run_task
 
 _POLL = 0.5
@@ -50,7 +52,7 @@ class Resimulation:
     ) -> None:
         self._folder = Path(folder)
         with Store.open(self._folder) as store:
-            self._study, loadings = store.study, store.read_loadings()
+            self._study, loadings = store.study, read_loadings(store)
         self._functions = [get_objective(name) for name in self._study.objectives]
         # A single sequence knows its autocorrelation badly: that of the study's own sequences is taken.
         self._rho = []
@@ -88,7 +90,8 @@ class Resimulation:
                     self._study.executor, lambda: None, self._folder, self._workers, self._scheduler
                 )
                 self._say(f"running on {executor.name}, {executor.n_workers} workers")
-                self._loop(executor, deque(_Waiting(task) for task in tasks))
+                limit = self._study.failures.max_worker_deaths
+                self._loop(executor, deque(_Waiting(task, Losses(limit)) for task in tasks))
         finally:
             if executor:
                 executor.close()
@@ -153,11 +156,11 @@ class Resimulation:
                 item = running.pop(task.folder)
                 if isinstance(result, WorkerLost):
                     self._say(str(result))
-                    item.deaths += 1
-                    if item.deaths < self._study.failures.max_worker_deaths:
+                    failure = item.losses.add(result)
+                    if failure is None:
                         waiting.appendleft(item)
                         continue
-                    result = TaskResult("failed", f"{result}, {item.deaths} times on end")
+                    result = failure
                 if result.status == "stopped":
                     continue
                 ended += 1
@@ -180,4 +183,4 @@ class Resimulation:
 @dataclass
 class _Waiting:
     task: Task
-    deaths: int = 0
+    losses: Losses

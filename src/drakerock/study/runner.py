@@ -10,6 +10,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import floor
@@ -19,12 +20,15 @@ from typing import Any
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.problem import Array
 from drakerock.exploration.sampling import make_sampler, make_validation_points
+from drakerock.identity import get_versions
 from drakerock.rocks.engine.compiling import are_kernels_compiled, describe_compilation
+from drakerock.study.db import Point, Store
 from drakerock.study.display import Display
-from drakerock.study.executors import Executor, WorkerLost, make_executor
+from drakerock.study.executors import Executor, Losses, WorkerLost, make_executor
 from drakerock.study.schema import StudyConfig
-from drakerock.study.store import Point, Store, export_tables, get_versions
-from drakerock.study.work import Task, TaskResult
+from drakerock.study.status import read_status
+from drakerock.study.tables import export_tables, read_responses
+from drakerock.study.work import Task, TaskResult, count_begun
 
 RUN_SEQUENCE = "drakerock.loading.sequence:run_sequence"
 _POLL = 0.5
@@ -52,7 +56,7 @@ def run_study(
         work: the function that runs a sequence, as ``module:name``.
 
     Returns:
-        The status at the end (`Store.read_status`).
+        The status at the end (`read_status`).
 
     Raises:
         InputError: the folder holds another study, cannot be written, or is in use.
@@ -64,7 +68,7 @@ def run_study(
         try:
             runner.run(workers, scheduler)
         finally:
-            status = store.read_status()
+            status = read_status(store)
             if display:
                 display.update(status, last=True)
     export_tables(folder)
@@ -78,6 +82,7 @@ class _Runner:
         self._store, self._study = store, store.study
         self._display, self._work = display, work
         self._running: dict[str, _Sequence] = {}
+        self._lost: deque[_Sequence] = deque()
         self._stop_file = store.folder / f".stop-{time.time_ns()}"
         self._shown = -1e9
         self._changed = True
@@ -139,12 +144,18 @@ class _Runner:
             # What there is to do changes only when a sequence ends.
             if self._changed and not stopping:
                 self._changed = False
-                waiting = [point for point in self._plan() if point.name not in self._running]
-            while waiting and not stopping and len(self._running) < max(executor.n_workers, 1):
-                self._submit(executor, waiting.pop(0))
+                begun = {*self._running, *(sequence.task.point for sequence in self._lost)}
+                waiting = [point for point in self._plan() if point.name not in begun]
+            while not stopping and len(self._running) < max(executor.n_workers, 1):
+                if self._lost:
+                    self._run(executor, self._lost.popleft())
+                elif waiting:
+                    self._submit(executor, waiting.pop(0))
+                else:
+                    break
             if self._running:
                 for task, result in executor.wait(_POLL):
-                    self._take(executor, task, result)
+                    self._take(task, result)
                 self._look()
             elif stopping:
                 raise KeyboardInterrupt
@@ -173,7 +184,7 @@ class _Runner:
         sampler = make_sampler(self._study.problem, config, self._study.seed)
         if n_samples == 0:
             return sampler.ask(min(len(sampler.initial), config.n_samples))
-        table = self._store.read_responses("sample")
+        table = read_responses(self._store, "sample")
         sampler.tell(table.X, table.Y, table.noise)
         # Of an initial design cut short by an earlier, smaller number of points, the rest comes first.
         left = len(sampler.initial) - n_samples
@@ -195,8 +206,12 @@ class _Runner:
             self._store.find_sequence_folder(point.name, attempt).resolve(), self._stop_file.resolve(),
             floor(self._study.failures.max_failed_share * self._study.loadings + 1e-9), self._work,
         )  # fmt: skip
-        self._running[point.name] = _Sequence(task, n_recorded)
-        executor.submit(task)
+        self._run(executor, _Sequence(task, n_recorded, self._study.failures.max_worker_deaths))
+
+    def _run(self, executor: Executor, sequence: _Sequence) -> None:
+        self._running[sequence.task.point] = sequence
+        sequence.n_forgiven = 0
+        executor.submit(sequence.task)
 
     def _look(self) -> None:
         """Record the cycles that have been finished since the last look, and show them."""
@@ -204,27 +219,33 @@ class _Runner:
             self._record(sequence)
         if self._display and time.monotonic() - self._shown > 1.0:
             self._shown = time.monotonic()
-            self._display.update(self._store.read_status())
+            self._display.update(read_status(self._store))
 
     def _record(self, sequence: _Sequence) -> None:
         task, now = sequence.task, time.monotonic()
         n = self._store.record_cycles(task.point, task.attempt, sequence.n_recorded, now - sequence.since)
         if n > sequence.n_recorded:
-            sequence.n_recorded, sequence.since, sequence.deaths = n, now, 0
+            sequence.n_recorded, sequence.since = n, now
+            sequence.losses, sequence.n_forgiven = (
+                Losses(sequence.losses.limit),
+                max(count_begun(task) - 1, 0),
+            )
 
-    def _take(self, executor: Executor, task: Task, result: TaskResult | WorkerLost) -> None:
-        sequence = self._running[task.point]
+    def _take(self, task: Task, result: TaskResult | WorkerLost) -> None:
+        sequence = self._running.pop(task.point)
         self._record(sequence)
         if isinstance(result, WorkerLost):
-            self._store.add_event("worker lost", f"{task.point} attempt {task.attempt}")
-            if self._display:
-                self._display.say(f"{task.point}: {result}")
-            sequence.deaths += 1
-            if sequence.deaths < self._study.failures.max_worker_deaths:
-                executor.submit(task)
+            if result.deaths:
+                self._store.add_event("worker lost", f"{task.point} attempt {task.attempt}")
+                if self._display:
+                    self._display.say(f"{task.point}: {result}")
+            result.deaths = max(result.deaths - sequence.n_forgiven, 0)
+            failure = sequence.losses.add(result)
+            if failure is None:
+                # Not at once: a worker is missing, and behind a running task it would wait for the others.
+                self._lost.append(sequence)
                 return
-            result = TaskResult("failed", f"{result}, {sequence.deaths} times on end")
-        del self._running[task.point]
+            result = failure
         self._changed = True
         if result.status == "disk":
             raise RunStopped(f"{task.folder}: {result.reason}")
@@ -246,12 +267,19 @@ class _Runner:
 
 
 class _Sequence:
-    """A running sequence: its task, the cycles recorded, since when, and the workers lost on end."""
+    """A sequence that has begun.
 
-    def __init__(self, task: Task, n_recorded: int) -> None:
-        self.task, self.n_recorded = task, n_recorded
+    Attributes:
+        task: what was submitted.
+        n_recorded, since: cycles recorded, and when the last was [s].
+        losses: the workers lost since then.
+        n_forgiven: workers lost since the submission, but before the last cycle was recorded.
+    """
+
+    def __init__(self, task: Task, n_recorded: int, max_deaths: int) -> None:
+        self.task, self.n_recorded, self.n_forgiven = task, n_recorded, 0
         self.since = time.monotonic()
-        self.deaths = 0
+        self.losses = Losses(max_deaths)
 
 
 def _next_batch(points: list[Point]) -> int:

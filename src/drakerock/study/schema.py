@@ -5,15 +5,14 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from drakerock.config import Config, calc_config_hash, load_config
+from drakerock.config import Config, list_types, load_config
 from drakerock.errors import InputError
-from drakerock.exploration.analysis import ExplorationConfig
+from drakerock.exploration.config import ExplorationConfig
 from drakerock.exploration.problem import Array, Problem, Variable
 from drakerock.loading.scenario import Scenario
 from drakerock.randomness import derive_seed
@@ -36,18 +35,10 @@ def _find_number(key: str) -> type:
             )  # fmt: skip
         annotation = names[part].annotation
         model = annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
-    kinds = _list_types(annotation)
+    kinds = list_types(annotation)
     if bool in kinds or not kinds & {int, float}:
         raise PydanticCustomError("key", "scenario key '{key}' is no number", {"key": key})
     return float if float in kinds else int
-
-
-def _list_types(annotation: Any) -> set[Any]:
-    if get_origin(annotation) is Annotated:
-        return _list_types(get_args(annotation)[0])
-    if get_origin(annotation) in (Union, UnionType):
-        return {kind for arg in get_args(annotation) for kind in _list_types(arg)}
-    return {annotation}
 
 
 class StudyVariable(Variable):
@@ -92,6 +83,10 @@ class FailureConfig(Config):
     ] = 3
 
 
+# Bytes, or with a unit: 4GB, 1.5 GiB, 500M.
+_MEMORY = r"^\d+(\.\d+)?( ?([kKMGTP]i?)?B?)?$"
+
+
 class SlurmConfig(Config):
     """Batch jobs, one worker each, asked of Slurm through dask-jobqueue."""
 
@@ -100,7 +95,7 @@ class SlurmConfig(Config):
     walltime: Annotated[str, Field(pattern=r"^(\d+-)?\d{1,2}:\d{2}:\d{2}$", description="of one job")] = (
         "24:00:00"
     )
-    memory: Annotated[str, Field(description="of one job, such as 4GB")] = "4GB"
+    memory: Annotated[str, Field(pattern=_MEMORY, description="of one job, such as 4GB")] = "4GB"
     directives: Annotated[tuple[str, ...], Field(description="further #SBATCH lines, without #SBATCH")] = ()
     prologue: Annotated[tuple[str, ...], Field(description="shell lines before the worker starts")] = ()
 
@@ -117,7 +112,11 @@ class ExecutorConfig(Config):
     )
     scheduler: Annotated[str | None, Field(description="address of a running Dask scheduler to use")] = None
     memory_limit: Annotated[
-        str, Field(description="per local worker, such as 4GB; auto: the memory's even share; 0: none")
+        str,
+        Field(
+            pattern=rf"^auto$|{_MEMORY}",
+            description="per local worker, such as 4GB; auto: the memory's even share; 0: none",
+        ),
     ] = "auto"
     slurm: SlurmConfig = SlurmConfig()
 
@@ -139,6 +138,8 @@ _METHOD_VARIABLES = tuple(
 
 class StudyConfig(Config):
     """A campaign: points of the design space, each a sequence of loadings."""
+
+    file_fields = ("modules",)
 
     name: str = "study"
     seed: Annotated[int, Field(ge=0, description="of the sampling plan; the scenario has its own")] = 0
@@ -222,8 +223,7 @@ class StudyConfig(Config):
         if attempt:
             seed = derive_seed(seed, "attempt", attempt) if self.failures.new_seed else seed
             step *= self.failures.time_step_factor**attempt
-        dynamics = scenario.dynamics.model_copy(update={"time_step": step})
-        return scenario.model_copy(update={"seed": seed, "dynamics": dynamics})
+        return scenario.replace(**{"seed": seed, "dynamics.time_step": step})
 
     def _set_variables(self, values: Mapping[str, float]) -> Scenario:
         data = self.scenario.model_dump(mode="json")
@@ -236,20 +236,19 @@ class StudyConfig(Config):
             target[last] = round(value) if variable.is_integer else value
         return Scenario.model_validate(data)
 
-    def calc_identity(self) -> str:
-        """Return the hash of all that the results depend on.
+    def make_neutral(self) -> Self:
+        """Return the study without what has no influence on its results.
 
-        Where it runs, what is kept, how the results are analysed and how many points are wanted are no part
-        of it: they may be changed when a study is resumed.
+        Where it runs, what is kept, how the results are analysed and how many points are wanted may be changed when a
+        study is resumed.
         """
-        sampling = self.exploration.sampling.model_copy(update={"n_samples": 1, "n_validation": 0})
-        neutral = {
-            "name": "study",
-            "executor": ExecutorConfig(),
-            "storage": StorageConfig(),
-            "exploration": ExplorationConfig(sampling=sampling),
-        }
-        return calc_config_hash(self.model_copy(update=neutral))
+        sampling = self.exploration.sampling.replace(n_samples=1, n_validation=0)
+        return self.replace(
+            name="study",
+            executor=ExecutorConfig(),
+            storage=StorageConfig(),
+            exploration=ExplorationConfig(sampling=sampling),
+        )
 
 
 def load_study(path: str | Path, overrides: Sequence[str] = ()) -> StudyConfig:
@@ -289,16 +288,6 @@ def load_study(path: str | Path, overrides: Sequence[str] = ()) -> StudyConfig:
         where = ".".join(str(part) for part in item["loc"])
         message = item["msg"].removeprefix("Value error, ")
         raise InputError(f"{path}: {where + ': ' if where else ''}{message}") from None
-
-
-def make_json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of a study file, for editors."""
-    schema = StudyConfig.model_json_schema()
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **schema,
-        "title": "drakerock study",
-    }
 
 
 class _StudyFile(StudyConfig):

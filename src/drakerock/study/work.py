@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import gc
 import importlib
+import os
+import socket
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Literal, Protocol
 
 from drakerock.errors import InputError
-from drakerock.loading.cycle import CycleOutcome
+from drakerock.identity import get_versions
+from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario
-from drakerock.study.store import get_versions, read_outcome
+from drakerock.study.db import read_outcome
 
 _DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
@@ -102,7 +107,9 @@ def run_task(task: Task, tick: Callable[[], None] | None = None) -> TaskResult:
     try:
         task.folder.parent.mkdir(parents=True, exist_ok=True)
         with _hold(task):
-            find_work(task.work)(task.scenario, task.n_loadings, task.folder, progress=progress)
+            work = find_work(task.work)
+            _freeze_imports()
+            work(task.scenario, task.n_loadings, task.folder, progress=progress)
         n_good, failure = _count_good(task)
     except _Stop:
         return TaskResult("stopped")
@@ -123,6 +130,15 @@ def find_work(name: str) -> Work:
     """Return the function of a ``module:name``."""
     module, _, function = name.partition(":")
     return getattr(importlib.import_module(module), function)
+
+
+@cache
+def _freeze_imports() -> None:
+    """Spare the garbage collector, which is asked to free each loading's Diagram, what was imported.
+
+    Of a small loading's 25 CPU seconds it takes 0.1 instead of 0.45.
+    """
+    gc.freeze()
 
 
 def is_disk_trouble(error: BaseException | None) -> bool:
@@ -149,10 +165,30 @@ def _count_good(task: Task) -> tuple[int, str]:
     return n_good, failure
 
 
+def mark_waiting(task: Task) -> None:
+    """Note that a task has not begun; `run_task` notes each time that it has."""
+    with suppress(OSError):  # trouble with the disk is for the worker to tell
+        _find_lock(task).parent.mkdir(parents=True, exist_ok=True)
+        _find_lock(task).write_text("")
+
+
+def count_begun(task: Task) -> int:
+    """Return how often a task has begun since `mark_waiting`: more than once where a scheduler has tried it again."""
+    try:
+        return len(_find_lock(task).read_text().splitlines())
+    except OSError:
+        return 1
+
+
+def _find_lock(task: Task) -> Path:
+    """Return the file that a worker holds while it runs the task, and that says which workers did."""
+    return task.folder.with_suffix(".lock")
+
+
 @contextmanager
 def _hold(task: Task) -> Iterator[None]:
     """Hold the sequence's folder: a worker that has lost its runner may still be busy in it."""
-    with open(task.folder.with_suffix(".lock"), "a") as lock:
+    with open(_find_lock(task), "a") as lock:
         while True:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -161,4 +197,6 @@ def _hold(task: Task) -> Iterator[None]:
                 if task.stop_file.exists():
                     raise _Stop from None
                 time.sleep(0.2)
+        lock.write(f"{socket.gethostname()} {os.getpid()}\n")
+        lock.flush()
         yield

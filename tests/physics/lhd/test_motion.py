@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pydrake.math import RollPitchYaw
 
-from drakerock.lhd.checks.bench import Bench, make_bench
-from drakerock.lhd.config import CheckConfig, MachineConfig
+from drakerock.lhd.checks.bench import Bench, CheckConfig, make_bench
+from drakerock.lhd.config import MachineConfig
 from drakerock.lhd.kinematics import calc_bucket_range, calc_joint_angles, calc_joint_rates, calc_tip
 from drakerock.lhd.placement import set_machine_angles, set_machine_pose
 

@@ -6,9 +6,11 @@ import trimesh
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drakerock.rocks.config import RocksConfig, SiteConfig
-from drakerock.rocks.drake.assembly import add_plant, add_site
-from drakerock.rocks.drake.plant_engine import add_plant_rocks, add_rock_bodies
+from drakerock.rocks.config import SiteConfig
+from drakerock.rocks.drake.add_rocks import AddRocks
+from drakerock.rocks.drake.drift import AddDrift
+from drakerock.rocks.drake.plant import add_plant
+from drakerock.rocks.drake.plant_engine import AddRockBodies
 from drakerock.rocks.engine.config import DynamicsConfig
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.site import Plane, Site
@@ -50,12 +52,12 @@ def simulate(shape, p_WRs, V_WRs, duration, *, tilt=0.0, dynamics=None, record=F
     )
     dynamics = dynamics or DynamicsConfig()
     builder = DiagramBuilder()
-    plant, _ = add_plant(builder, dynamics)
+    plant, scene_graph = add_plant(builder, dynamics)
     floor = Plane("floor", np.array([-np.sin(tilt), 0.0, np.cos(tilt)]), 0.0)
-    add_site(plant, Site(SiteConfig(), (floor,), ()), dynamics)
-    geometries = add_rock_bodies(plant, pile, (shape,), RocksConfig(), dynamics)
+    AddDrift(plant, Site(SiteConfig(), (floor,), ()), dynamics.plant)
+    bodies = AddRockBodies(plant, pile, config=dynamics.plant, shapes=(shape,))
     plant.Finalize()
-    rocks = add_plant_rocks(builder, plant, pile, geometries)
+    rocks = AddRocks(builder, plant, scene_graph, pile, engine=bodies)
     simulator = Simulator(builder.Build())
     root = simulator.get_mutable_context()
     rocks.set_pile(root, pile)

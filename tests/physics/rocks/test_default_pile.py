@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drakerock.config import calc_config_hash
+from drakerock.identity import calc_config_hash
 from drakerock.loading.scenario import Scenario, load_scenario, make_recipe
 from drakerock.resources import find_data
 from drakerock.rocks.making.settling import check_pile, fetch_pile, settle
@@ -21,7 +21,7 @@ SITE = make_site(RECIPE.site)
 def pile():
     pile, path = fetch_pile(RECIPE)
     # Not so? The default scenario or the engine's settings have changed: python src/drakerock/data/make_default_pile.py
-    assert path == find_data("piles", "default.npz")
+    assert path == find_data("data", "default_pile.npz")
     assert pile.provenance["recipe"] == calc_config_hash(RECIPE)
     return pile
 
@@ -32,7 +32,7 @@ def test_full_size_study_takes_the_shipped_pile():
 
 
 def test_shipped_pile_is_small_and_inside_the_site(pile):
-    path = find_data("piles", "default.npz")
+    path = find_data("data", "default_pile.npz")
     assert path.stat().st_size < 1_000_000
     check_pile(pile, RECIPE, path)
 
@@ -70,11 +70,7 @@ def test_300_woken_rocks_stay_where_they_are(pile, centre):
     resting[woken] = False
     start = replace(pile, contacts=replace(pile.contacts, resting=resting))
     # Without the rest rule, so that they stay awake for all of the time.
-    rest = RECIPE.dynamics.nonsmooth.rest.model_copy(update={"time": 1e9})
-    nonsmooth = RECIPE.dynamics.nonsmooth.model_copy(update={"rest": rest})
-    recipe = RECIPE.model_copy(
-        update={"dynamics": RECIPE.dynamics.model_copy(update={"nonsmooth": nonsmooth})}
-    )
+    recipe = RECIPE.replace(**{"dynamics.nonsmooth.rest.time": 1e9})
     after, _ = settle(start, load_rock_shapes(RECIPE.rocks.shapes), recipe, 5.0)
     moved = np.linalg.norm(after.p_WRs - pile.p_WRs, axis=1)[woken]
     assert moved.mean() < 0.005

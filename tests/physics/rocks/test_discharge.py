@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from drakerock.rocks.config import RocksConfig, SiteConfig
 from drakerock.rocks.engine.config import NonsmoothConfig
 from drakerock.rocks.engine.engine import NonsmoothEngine
-from drakerock.rocks.site import ConvexPiece, Plane, Site
+from drakerock.rocks.site import ConvexPiece, Plane, Site, make_surroundings
 from drakerock.rocks.state import PileState
 
 D = 0.1  # sieve width of the rocks [m]
@@ -51,7 +51,7 @@ def calc_discharge(shapes, opening: float, seed: int) -> float:
         engine = NonsmoothEngine(
             RocksConfig(),
             shapes,
-            site,
+            make_surroundings(site),
             NonsmoothConfig(reduction="none"),
             DT,
             pile.shape,

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drakerock.config import calc_config_hash
 from drakerock.errors import InputError
+from drakerock.identity import calc_config_hash
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.rocks.contact_graph import find_loose
 from drakerock.rocks.making.emission import calc_level, make_emitter, sample_rocks

@@ -5,8 +5,9 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from drakerock.errors import InputError
+from drakerock.exploration.config import ParetoConfig, SamplingConfig, SensitivityConfig
 from drakerock.exploration.confirmation import Confirmation, confirm_points
-from drakerock.exploration.pareto import ParetoConfig, pareto_front
+from drakerock.exploration.pareto import pareto_front
 from drakerock.exploration.problem import Objective, Problem, Variable
 from drakerock.exploration.problems import (
     calc_loading_spread,
@@ -18,12 +19,11 @@ from drakerock.exploration.problems import (
     make_zdt,
 )
 from drakerock.exploration.sampling import (
-    SamplingConfig,
     make_initial_design,
     make_sampler,
     make_validation_points,
 )
-from drakerock.exploration.sensitivity import SensitivityConfig, calc_sensitivity
+from drakerock.exploration.sensitivity import calc_sensitivity
 from drakerock.exploration.surrogate import Surrogate, calc_ranges, fit_surrogate
 from drakerock.exploration.validation import validate
 

@@ -6,9 +6,8 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.distance import cdist
 
 from drakerock.errors import InputError
+from drakerock.exploration.config import Bound, ParetoConfig
 from drakerock.exploration.pareto import (
-    Bound,
-    ParetoConfig,
     calc_non_dominated,
     pareto_front,
     parse_bound,

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drakerock.errors import InputError
-from drakerock.exploration.pareto import Bound, ParetoConfig, ParetoFront, pareto_front
+from drakerock.exploration.config import Bound, ParetoConfig
+from drakerock.exploration.pareto import ParetoFront, pareto_front
 from drakerock.exploration.problem import Objective, Problem, Variable
 from drakerock.exploration.problems import make_noisy_loading
 from drakerock.exploration.strategy import choose_strategy, parse_weights

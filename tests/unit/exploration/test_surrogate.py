@@ -8,13 +8,13 @@ from sklearn.gaussian_process.kernels import RBF
 from sklearn.utils.estimator_checks import check_estimator
 
 from drakerock.errors import InputError
+from drakerock.exploration.config import SurrogateConfig
 from drakerock.exploration.problem import Objective, Problem, Variable
 from drakerock.exploration.problems import make_branin, make_ishigami, make_noisy_loading, make_noisy_table
 from drakerock.exploration.surrogate import (
     Kriging,
     PowerExponential,
     Surrogate,
-    SurrogateConfig,
     calc_correlation,
     fit_surrogate,
 )

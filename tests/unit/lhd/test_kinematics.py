@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import JacobianWrtVariable
 
+from drakerock.errors import InputError
 from drakerock.lhd.kinematics import (
     calc_bucket_pose,
     calc_bucket_range,
@@ -180,3 +181,5 @@ def test_reach_is_the_methods(kin):
     assert calc_reach(kin, np.radians(40)) == pytest.approx(4.24, rel=0.01)
     longer = dataclasses.replace(kin, bucket_length=kin.bucket_length + 0.3)
     assert calc_reach(longer, np.radians(40)) > 4.4
+    with pytest.raises(InputError, match="slope of 89 deg"):
+        calc_reach(dataclasses.replace(kin, bucket_length=0.5), np.radians(89))

@@ -8,16 +8,16 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from drakerock.lhd.kinematics import calc_jacobian, calc_pitch, calc_tip
 from drakerock.lhd.measurement import MEASUREMENT
 from drakerock.loading.config import ControlConfig
-from drakerock.loading.control import (
+from drakerock.loading.control import FeedforwardController, calc_motor_speeds
+from drakerock.loading.plan import NoPlan
+from drakerock.loading.segments import (
     TIMEOUTS,
     WAYPOINT_TIMES,
-    FeedforwardController,
     Mode,
+    SegmentTracker,
     calc_allowed_time,
-    calc_motor_speeds,
     calc_passed,
 )
-from drakerock.loading.plan import NoPlan
 from tests.unit.loading.test_planning import make_wedge, plan_for
 
 
@@ -101,12 +101,15 @@ def test_full_tilt_stop_passes_s3_though_the_boom_sags(plan, digger):
 
 def run_alone(digger, plan, measured, duration):
     builder = DiagramBuilder()
-    controller = builder.AddSystem(FeedforwardController(digger.kinematics, ControlConfig(), 0.01))
+    controller = builder.AddSystem(FeedforwardController(digger.kinematics))
+    tracker = builder.AddSystem(SegmentTracker(digger.kinematics, ControlConfig(), 0.01))
     plan_source = builder.AddSystem(ConstantValueSource(AbstractValue.Make(plan)))
     sensor = builder.AddSystem(ConstantVectorSource(measured))
-    builder.Connect(plan_source.get_output_port(), controller.GetInputPort("plan"))
-    builder.Connect(sensor.get_output_port(), controller.GetInputPort("measurement"))
-    builder.ExportOutput(controller.GetOutputPort("progress"), "progress")
+    for system in (controller, tracker):
+        builder.Connect(plan_source.get_output_port(), system.GetInputPort("plan"))
+        builder.Connect(sensor.get_output_port(), system.GetInputPort("measurement"))
+    builder.Connect(tracker.GetOutputPort("mode"), controller.GetInputPort("mode"))
+    builder.ExportOutput(tracker.GetOutputPort("progress"), "progress")
     builder.ExportOutput(controller.GetOutputPort("motor_speeds"), "motor_speeds")
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(duration)

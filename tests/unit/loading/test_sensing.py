@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydrake.common.value import AbstractValue
+from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import DiagramBuilder
@@ -73,14 +73,14 @@ def test_what_lies_behind_the_brow_is_not_sensed(heap, shapes):
 def test_sensor_alone_in_a_users_diagram(heap, shapes):
     builder = DiagramBuilder()
     site = SiteConfig(drift_width=3.9)
-    sensor = builder.AddSystem(PileSensor(heap, shapes, site, SensingConfig(), 5.0))
-    builder.ExportInput(sensor.GetInputPort("rock_poses"), "rock_poses")
+    sensor = builder.AddSystem(PileSensor(shapes, site, SensingConfig(), 5.0))
+    builder.ExportInput(sensor.GetInputPort("pile"), "pile")
     builder.ExportOutput(sensor.GetOutputPort("height_field"), "height_field")
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
     for shift in (0.0, -1.0):
         moved = replace(heap, p_WRs=heap.p_WRs + [shift, 0, 0])
-        diagram.get_input_port().FixValue(context, np.hstack([moved.q_WRs, moved.p_WRs]).ravel())
+        diagram.get_input_port().FixValue(context, Value[object](moved))
         seen = diagram.get_output_port().Eval(context)
         assert np.array_equal(seen.h, calc_height_field(moved, shapes, site, 0.26, 5.0).h)
 
@@ -91,7 +91,7 @@ QUIET_SITE = SiteConfig(drift_width=3.9)
 
 
 def scan(heap, shapes, seed=0, **changes):
-    config = SCANNER.model_copy(update=changes)
+    config = SCANNER.replace(**changes)
     return calc_scan(heap, shapes, config, X_WF, np.random.default_rng(seed))
 
 
@@ -119,7 +119,7 @@ def calc_outside(equations, point):
 
 
 def test_rays_fill_the_field_of_view():
-    rays = make_ray_directions(SCANNER.model_copy(update={"resolution_deg": 1.0}))
+    rays = make_ray_directions(SCANNER.replace(resolution_deg=1.0))
     assert len(rays) == 121 * 61
     assert np.allclose(np.linalg.norm(rays, axis=1), 1.0)
     assert np.rad2deg(np.arcsin(rays[:, 2])).min() == pytest.approx(-30.0)
@@ -197,12 +197,12 @@ def test_scan_gives_about_the_ideal_field_where_it_sees(shapes):
 def test_scanner_in_a_users_diagram_is_deterministic_and_noisy_anew(heap, shapes):
     config = SensingConfig(kind="scanner")
     with pytest.raises(InputError, match="front unit"):
-        PileSensor(heap, shapes, QUIET_SITE, config, 5.0)
+        PileSensor(shapes, QUIET_SITE, config, 5.0)
 
     def see(pile, seed):
-        sensor = PileSensor(heap, shapes, QUIET_SITE, config, 5.0, seed=seed, front_unit=BodyIndex(1))
+        sensor = PileSensor(shapes, QUIET_SITE, config, 5.0, seed=seed, front_unit=BodyIndex(1))
         context = sensor.CreateDefaultContext()
-        sensor.GetInputPort("rock_poses").FixValue(context, np.hstack([pile.q_WRs, pile.p_WRs]).ravel())
+        sensor.GetInputPort("pile").FixValue(context, Value[object](pile))
         poses = AbstractValue.Make([RigidTransform(), X_WF])
         sensor.GetInputPort("body_poses").FixValue(context, poses)
         return sensor.GetOutputPort("height_field").Eval(context).h

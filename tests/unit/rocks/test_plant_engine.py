@@ -10,10 +10,12 @@ from drakerock.lhd.geometry import collision_pieces
 from drakerock.lhd.model import add_machine
 from drakerock.rocks.config import RocksConfig, SiteConfig
 from drakerock.rocks.contact_graph import find_contacts, find_loose
-from drakerock.rocks.drake.assembly import add_plant, add_site
-from drakerock.rocks.drake.coupling import make_machine_layout
+from drakerock.rocks.drake.add_rocks import AddRocks
+from drakerock.rocks.drake.drift import AddDrift
+from drakerock.rocks.drake.geometry import read_plant_geometry
 from drakerock.rocks.drake.interface import ROCK_SUMMARY
-from drakerock.rocks.drake.plant_engine import add_plant_rocks, add_rock_bodies
+from drakerock.rocks.drake.plant import add_plant
+from drakerock.rocks.drake.plant_engine import AddRockBodies
 from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
 from drakerock.rocks.materials import calc_contact_stiffness, calc_pair_friction
 from drakerock.rocks.site import make_site
@@ -23,11 +25,11 @@ from rock_helpers import make_engine
 
 def build(pile, shapes):
     builder = DiagramBuilder()
-    plant, _ = add_plant(builder, DynamicsConfig())
-    add_site(plant, make_site(SiteConfig(drift_width=3.9)), DynamicsConfig())
-    geometries = add_rock_bodies(plant, pile, shapes, RocksConfig(), DynamicsConfig())
+    plant, scene_graph = add_plant(builder, DynamicsConfig())
+    AddDrift(plant, make_site(SiteConfig(drift_width=3.9)))
+    bodies = AddRockBodies(plant, pile, shapes=shapes)
     plant.Finalize()
-    rocks = add_plant_rocks(builder, plant, pile, geometries)
+    rocks = AddRocks(builder, plant, scene_graph, pile, engine=bodies)
     return builder.Build(), plant, rocks
 
 
@@ -41,10 +43,10 @@ def test_written_pile_is_read_back_and_shown_by_the_ports(heap, shapes):
     assert np.allclose(back.q_WRs, heap.q_WRs, atol=1e-12)
     assert np.allclose(back.V_WRs, moving.V_WRs, atol=1e-12)
     context = rocks.GetMyContextFromRoot(root)
-    poses = rocks.GetOutputPort("rock_poses").Eval(context).reshape(-1, 7)
-    assert np.allclose(poses, np.hstack([heap.q_WRs, heap.p_WRs]), atol=1e-12)
-    assert np.allclose(rocks.GetOutputPort("rock_velocities").Eval(context), moving.V_WRs.ravel(), atol=1e-12)
-    assert len(rocks.GetOutputPort("rock_summary").Eval(context)) == len(ROCK_SUMMARY)
+    shown = rocks.GetOutputPort("pile").Eval(context)
+    assert np.allclose(np.hstack([shown.q_WRs, shown.p_WRs]), np.hstack([heap.q_WRs, heap.p_WRs]), atol=1e-12)
+    assert np.allclose(shown.V_WRs, moving.V_WRs, atol=1e-12)
+    assert len(rocks.GetOutputPort("summary").Eval(context)) == len(ROCK_SUMMARY)
     body = plant.GetBodyByName("rock_7")
     assert np.allclose(
         plant.EvalBodyPoseInWorld(plant.GetMyContextFromRoot(root), body).translation(), heap.p_WRs[7]
@@ -98,8 +100,8 @@ def test_effective_friction_of_every_pair_is_the_methods():
     plant.Finalize()
     pieces = collision_pieces(plant, scene_graph, machine)
     rock, drift = RocksConfig().friction, SiteConfig().friction
-    tyre = pieces["wheel_front_left"][0].mu
-    bucket = {piece.mu for piece in pieces["bucket"]}
+    tyre = pieces["wheel_front_left"][0].material.friction
+    bucket = {piece.material.friction for piece in pieces["bucket"]}
     assert calc_pair_friction(rock, rock) == pytest.approx(0.9)
     assert calc_pair_friction(rock, drift) == pytest.approx(1.0)
     assert calc_pair_friction(tyre, drift) == pytest.approx(1.0)
@@ -138,7 +140,7 @@ def test_only_the_floor_is_a_half_space(heap, shapes):
     inspector = diagram.GetSubsystemByName("scene_graph").model_inspector()
     kinds = [type(inspector.GetShape(geometry)).__name__ for geometry in inspector.GetAllGeometryIds()]
     assert kinds.count("HalfSpace") == 1
-    assert kinds.count("Box") == 3
+    assert kinds.count("Box") == 3 + 6  # and what is drawn of them
 
 
 def test_walls_hold_rocks_in(heap, shapes):
@@ -163,12 +165,12 @@ def test_the_nonsmooth_engines_linear_law_has_the_plants_springs(heap, shapes):
     builder = DiagramBuilder()
     dynamics = DynamicsConfig(nonsmooth=NonsmoothConfig(linear_overlap=DynamicsConfig().reference_overlap))
     plant, scene_graph = add_plant(builder, dynamics)
-    machine = add_machine(plant, MachineConfig())
-    geometries = add_rock_bodies(plant, heap, shapes, RocksConfig(), dynamics)
+    add_machine(plant, MachineConfig())
+    geometries = AddRockBodies(plant, heap, shapes=shapes).geometries
     plant.Finalize()
-    layout = make_machine_layout(plant, scene_graph, machine, 2.0, 0.3)
+    found = read_plant_geometry(plant, scene_graph, [-9.0] * 3, [9.0] * 3, geometries)
     engine = make_engine(
-        heap, shapes, config=dynamics.nonsmooth, pieces=layout.pieces, n_machine_bodies=len(layout.bodies)
+        heap, shapes, config=dynamics.nonsmooth, pieces=found.pieces, n_machine_bodies=len(found.bodies)
     )
     inspector = scene_graph.model_inspector()
 
@@ -180,6 +182,6 @@ def test_the_nonsmooth_engines_linear_law_has_the_plants_springs(heap, shapes):
     rocks, still, bodies = np.split(engine.softness, [len(heap), len(heap) + 1])
     assert rocks == pytest.approx([get_softness(geometry) for geometry in geometries])
     assert still == 0.0
-    for softness, name in zip(bodies, layout.bodies, strict=True):
-        body = plant.GetBodyByName(name, machine.instance)
+    for softness, index in zip(bodies, found.bodies, strict=True):
+        body = plant.get_body(index)
         assert softness == get_softness(plant.GetCollisionGeometriesForBody(body)[0])

@@ -7,11 +7,8 @@ from typer.testing import CliRunner
 import drakerock
 from drakerock.cli import app
 from drakerock.errors import InputError
-from drakerock.exploration.analysis import ExplorationConfig
-from drakerock.exploration.pareto import ParetoConfig
+from drakerock.exploration.config import ExplorationConfig, ParetoConfig, SensitivityConfig, SurrogateConfig
 from drakerock.exploration.problems import make_noisy_loading, make_noisy_table
-from drakerock.exploration.sensitivity import SensitivityConfig
-from drakerock.exploration.surrogate import SurrogateConfig
 from drakerock.study.analysis import run_confirm, run_report, run_strategy
 
 KNOWN = make_noisy_loading()

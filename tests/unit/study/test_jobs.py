@@ -3,7 +3,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from drakerock.loading.cycle import CycleOutcome
+from drakerock.loading.outcome import CycleOutcome
 from drakerock.study.jobs import calc_sequence_summary
 
 

@@ -12,11 +12,15 @@ import study_work
 from drakerock.config import parse_config
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.table import ResponseTable
+from drakerock.study import db
+from drakerock.study.db import Store
 from drakerock.study.executors import make_slurm_cluster
 from drakerock.study.resimulation import Resimulation
 from drakerock.study.runner import run_study
 from drakerock.study.schema import SlurmConfig, StudyConfig
-from drakerock.study.store import Store, export_tables
+from drakerock.study.status import read_status
+from drakerock.study.tables import export_tables
+from drakerock.study.verify import verify_store
 
 WORK = "study_work:run"
 TEXT = """
@@ -57,8 +61,8 @@ def copy(finished, tmp_path):
 
 def test_a_study_runs_to_its_end(finished):
     with Store.open(finished) as store:
-        status, points = store.read_status(), store.list_points()
-        assert store.verify() == []
+        status, points = read_status(store), store.list_points()
+        assert verify_store(store) == []
     assert status["complete"]
     assert status["points"] == {"total": 19, "done": 19, "failed": 0, "running": 0, "to_do": 0}
     assert status["cycles"] == {"total": 76, "recorded": 76, "failed": 0}
@@ -116,6 +120,34 @@ def test_a_study_can_grow_but_not_change(copy):
     assert np.array_equal(old.X[:16], new.select("sample").X[:16])
 
 
+def test_a_study_whose_files_or_program_changed_is_another(tmp_path, monkeypatch):
+    model = tmp_path / "machine.sdf"
+    model.write_text("<sdf/>")
+    study = make_study(f"scenario.machine.model={model}")
+    Store.create(tmp_path / "store", study).close()
+    Store.create(tmp_path / "store", study).close()
+    same = shutil.copy(model, tmp_path / "copy.sdf")
+    Store.create(tmp_path / "store", make_study(f"scenario.machine.model={same}")).close()
+    with monkeypatch.context() as patch:
+        patch.setattr(db, "RESULTS_REVISION", db.RESULTS_REVISION + 1)
+        with pytest.raises(InputError, match=r"another study \(different: results revision\)"):
+            Store.create(tmp_path / "store", study)
+    model.write_text("<sdf></sdf>")
+    with pytest.raises(InputError, match=r"another study \(different: scenario\.machine\.model\)"):
+        Store.create(tmp_path / "store", study)
+
+
+def test_a_store_of_an_earlier_version_can_be_read_not_resumed(copy):
+    with Store.create(copy, make_study()) as store, store.transaction() as connection:
+        connection.execute("DELETE FROM meta")
+        connection.execute("PRAGMA user_version = 1")
+    with Store.open(copy) as store:
+        assert read_status(store)["complete"]
+        assert verify_store(store) == []
+    with pytest.raises(InputError, match="made by an earlier version"):
+        Store.create(copy, make_study())
+
+
 def test_grown_and_whole_are_the_same(tmp_path, copy):
     more = ("exploration.sampling.n_samples=19", "exploration.sampling.n_validation=5")
     run_study(make_study(*more), copy, work=WORK)
@@ -132,7 +164,7 @@ def test_inputs_that_changed_are_simulated_anew(copy, monkeypatch):
     run_study(make_study(), copy, work=WORK)
     assert path.stat().st_mtime_ns > old
     with Store.open(copy) as store:
-        assert store.verify() == []
+        assert verify_store(store) == []
 
 
 @pytest.mark.parametrize(
@@ -150,7 +182,7 @@ def test_inputs_that_changed_are_simulated_anew(copy, monkeypatch):
 def test_verify_finds_what_is_wrong(copy, harm, kind):
     harm(copy / "points/s0002/attempt_0/loading_01/signals.bin")
     with Store.open(copy) as store:
-        (fault,) = store.verify()
+        (fault,) = verify_store(store)
     assert fault.kind == kind
     assert fault.path.startswith("points/s0002/attempt_0/loading_0")
 
@@ -160,13 +192,13 @@ def test_verify_finds_a_database_that_says_something_else(copy):
         db.execute("UPDATE cycles SET outcome = json_set(outcome, '$.energy_J', 2) WHERE point = 's0001' "
                    "AND loading = 0")  # fmt: skip
     with Store.open(copy) as store:
-        assert [fault.kind for fault in store.verify()] == ["mismatch"]
+        assert [fault.kind for fault in verify_store(store)] == ["mismatch"]
 
 
 def test_keeping_outcomes_only(tmp_path):
     run_study(make_study("storage.keep=outcomes"), tmp_path / "store", work=WORK)
     with Store.open(tmp_path / "store") as store:
-        assert store.verify() == []
+        assert verify_store(store) == []
     names = {path.name for path in (tmp_path / "store/points").rglob("*") if path.is_file()}
     assert names <= {"outcome.json", "attempt_0.lock"}
 
@@ -180,11 +212,11 @@ def test_failures_are_retried_with_another_seed_and_step(tmp_path, behave):
     assert failed == {name for name, x in zip(table.point, table.X, strict=True) if x[0] > 1.5}
     assert np.isfinite(table.Y).all()
     with Store.open(tmp_path / "store") as store:
-        rows = store._db.execute(
+        rows = store.db.execute(
             "SELECT point, attempt, seed, status, reason FROM sequences WHERE point = ? ORDER BY attempt",
             (min(failed),),
         ).fetchall()
-        assert store.verify() == []
+        assert verify_store(store) == []
     assert [row[3] for row in rows] == ["failed", "done"]
     assert rows[0][2] != rows[1][2]
     assert "made to fail" in rows[0][4]
@@ -217,11 +249,11 @@ def test_points_that_always_fail_are_marked_not_dropped(tmp_path, behave, mode, 
     assert np.isfinite(table.Y[~lost]).all()
     assert all("made" in text for text, gone in zip(table.failure, lost, strict=True) if gone)
     with Store.open(tmp_path / "store") as store:
-        (n,) = store._db.execute("SELECT COUNT(*) FROM sequences WHERE point = ?", (min(marked),)).fetchone()
-        (trace,) = store._db.execute(
+        (n,) = store.db.execute("SELECT COUNT(*) FROM sequences WHERE point = ?", (min(marked),)).fetchone()
+        (trace,) = store.db.execute(
             "SELECT traceback FROM sequences WHERE point = ? AND attempt = 0", (min(marked),)
         ).fetchone()
-        assert store.verify() == []
+        assert verify_store(store) == []
     assert n == attempts
     assert "study_work.py" in trace
 
@@ -231,7 +263,7 @@ def test_a_full_disk_of_a_worker_stops_the_run_and_is_no_failure(tmp_path, behav
     with pytest.raises(RunStopped, match="No space left"):
         run_study(make_study(), tmp_path / "store", work=WORK)
     with Store.open(tmp_path / "store") as store:
-        status = store.read_status()
+        status = read_status(store)
         assert status["failures"] == []
         assert "No space left" in status["last_run"]["ending"]
     behave("")
@@ -331,12 +363,12 @@ def test_a_full_disk_of_the_store_loses_nothing(tmp_path):
     study = make_study()
     with Store.create(tmp_path / "store", study) as store:
         store.add_points("sample", 0, np.full((3, 4), 0.5))
-        (pages,) = store._db.execute("PRAGMA page_count").fetchone()
-        store._db.execute(f"PRAGMA max_page_count = {pages}")
+        (pages,) = store.db.execute("PRAGMA page_count").fetchone()
+        store.db.execute(f"PRAGMA max_page_count = {pages}")
         with pytest.raises(RunStopped, match="full"):
             store.add_points("validation", 0, np.full((2000, 4), 0.5))
         assert len(store.list_points()) == 3
-        store._db.execute("PRAGMA max_page_count = 100000")
+        store.db.execute("PRAGMA max_page_count = 100000")
         store.add_points("validation", 0, np.full((20, 4), 0.5))
         assert len(store.list_points()) == 23
 
@@ -347,6 +379,7 @@ def test_slurm_job_script(tmp_path):
         directives=("--constraint=avx2",), prologue=("module load python",),
     )  # fmt: skip
     with make_slurm_cluster(config, tmp_path) as cluster:
+        assert cluster.scheduler.allowed_failures == 0  # the runner tries again, and counts
         script = cluster.job_script()
     for line in (
         "#SBATCH -p compute", "#SBATCH -A mine", "#SBATCH -n 1", "#SBATCH --cpus-per-task=1", "#SBATCH -t 12:00:00",

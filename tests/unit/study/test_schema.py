@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import yaml
 
+from drakerock.config import make_json_schema
 from drakerock.errors import InputError
 from drakerock.study.objectives import get_objective
-from drakerock.study.schema import load_study, make_json_schema
+from drakerock.study.schema import StudyConfig, load_study
 
 
 @pytest.fixture
@@ -82,14 +83,14 @@ def test_objectives_of_ones_own(write, tmp_path):
     assert get_objective("reward").function.__name__ == "calc_reward"
 
 
-def test_identity_is_what_results_depend_on(write):
+def test_what_is_left_of_a_neutral_study_is_what_results_depend_on(write):
     base = load_study(write())
     for same in ("executor.workers=7", "storage.keep=outcomes", "name=other", "exploration.sampling.n_samples=300",
                  "exploration.pareto.population=50"):  # fmt: skip
-        assert load_study(write(), [same]).calc_identity() == base.calc_identity(), same
+        assert load_study(write(), [same]).make_neutral() == base.make_neutral(), same
     for other in ("seed=1", "loadings=3", "scenario.seed=9", "failures.retries=0",
                   "exploration.sampling.batch_size=3", "objectives=[damage]"):  # fmt: skip
-        assert load_study(write(), [other]).calc_identity() != base.calc_identity(), other
+        assert load_study(write(), [other]).make_neutral() != base.make_neutral(), other
 
 
 @pytest.mark.parametrize(
@@ -134,7 +135,7 @@ def test_errors_name_file_key_and_what_is_allowed(write, data, parts):
 
 
 def test_json_schema_describes_the_keys():
-    schema = json.loads(json.dumps(make_json_schema()))
+    schema = json.loads(json.dumps(make_json_schema(StudyConfig, "study")))
     assert schema["additionalProperties"] is False
     assert {"variables", "objectives", "loadings", "executor", "storage"} <= set(schema["properties"])
     assert schema["$defs"]["StrategyConfig"]["properties"]["alpha"]["maximum"] == 2

@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from drakerock.exploration.analysis import ExplorationConfig, explore
+from drakerock.exploration.analysis import explore
+from drakerock.exploration.config import ExplorationConfig, ParetoConfig, SensitivityConfig, SurrogateConfig
 from drakerock.exploration.confirmation import confirm_points
-from drakerock.exploration.pareto import ParetoConfig
 from drakerock.exploration.problem import Objective, Problem, Variable
 from drakerock.exploration.problems import make_noisy_loading, make_noisy_table
-from drakerock.exploration.sensitivity import SensitivityConfig
 from drakerock.exploration.strategy import choose_strategy
-from drakerock.exploration.surrogate import SurrogateConfig
 from drakerock.exploration.table import ResponseTable
 from drakerock.viewing.exploration_figures import draw_front, draw_nested_contours, make_figures, save_figures
 from drakerock.viewing.report import make_report, write_report

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
+from pydantic import Field
 from pydrake.common.value import Value
 from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, SceneGraph, Shape
 from pydrake.math import RigidTransform
@@ -23,8 +24,10 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from shapely import Polygon
 
+from drakerock.config import Config
+from drakerock.errors import SimulationFailure
 from drakerock.lhd import names
-from drakerock.lhd.config import CheckConfig, MachineConfig
+from drakerock.lhd.config import MachineConfig
 from drakerock.lhd.geometry import BucketGeometry, calc_area, make_bucket_geometry, read_profile
 from drakerock.lhd.hinge import HingeMoment, add_hinge_moment
 from drakerock.lhd.kinematics import Kinematics, make_kinematics
@@ -34,6 +37,16 @@ from drakerock.lhd.model import Machine, add_machine, calc_motor_targets
 Array = np.ndarray
 
 _HALF_FLOOR = (60.0, 20.0, 5.0)
+
+
+class CheckConfig(Config):
+    """The bench on which the machine is checked."""
+
+    time_step: float = Field(default=0.01, gt=0, description="of the plant [s]")
+    contact_approximation: str = Field(default="lagged", pattern="^(lagged|similar|sap)$")
+    floor_friction: float = Field(default=1.125, gt=0, description="of the floor; tyres bring their own")
+    floor_stiffness: float = Field(default=1e10, gt=0, description="of floor and obstacles [N/m]")
+    floor_dissipation: float = Field(default=1.0, ge=0, description="of floor and obstacles [s/m]")
 
 
 @dataclass(frozen=True)
@@ -84,7 +97,11 @@ class Bench:
         self.plant.get_applied_spatial_force_input_port().FixValue(self.plant_context, Value([load]))
 
     def run(self, duration: float, *, wheel: float = 0.0, boom: float = 0.0, bucket: float = 0.0) -> Record:
-        """Run with constant motor targets [rad/s] for `duration` [s] and record every step."""
+        """Run with constant motor targets [rad/s] for `duration` [s] and record every step.
+
+        Raises:
+            SimulationFailure: a step could not be solved.
+        """
         plant, machine = self.plant, self.machine
         context, root = self.plant_context, self.context
         targets = calc_motor_targets(plant, machine, wheel, boom, bucket)
@@ -96,7 +113,10 @@ class Bench:
         wall = 0.0
         for k in range(1, steps + 1):
             begin = perf_counter()
-            self.simulator.AdvanceTo((start + k) * plant.time_step())
+            try:
+                self.simulator.AdvanceTo((start + k) * plant.time_step())
+            except RuntimeError as error:
+                raise SimulationFailure(f"{machine.config.model}: the bench's step failed: {error}") from None
             wall += perf_counter() - begin
             columns["time"].append(root.get_time())
             columns["q"].append(plant.GetPositions(context, machine.instance))

@@ -1,6 +1,8 @@
-"""Rocks as free bodies of the machine's plant."""
+"""Rocks as free bodies of the plant: the engine that is the plant itself, for small piles and as a reference."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,46 +11,84 @@ from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
     AddContactMaterial,
     GeometryId,
+    GeometryInstance,
+    IllustrationProperties,
+    PerceptionProperties,
     ProximityProperties,
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults, CoulombFriction, MultibodyPlant
-from pydrake.multibody.tree import RotationalInertia, SpatialInertia
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
+from pydrake.multibody.tree import BodyIndex, RotationalInertia, SpatialInertia
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus
 
-from drakerock.errors import SimulationFailure
+from drakerock.errors import InputError, SimulationFailure
+from drakerock.memory import weak
 from drakerock.rocks.config import RocksConfig
-from drakerock.rocks.drake.assembly import make_convex, make_pose
-from drakerock.rocks.drake.interface import ROCK_SUMMARY
-from drakerock.rocks.engine.config import DynamicsConfig
+from drakerock.rocks.drake.drift import make_convex
+from drakerock.rocks.drake.interface import ROCK_SUMMARY, RockContacts, RockSystem, make_empty_contacts
+from drakerock.rocks.drake.poses import make_pose
+from drakerock.rocks.drake.scene import make_rock_looks
+from drakerock.rocks.engine.config import PlantEngineConfig
 from drakerock.rocks.engine.motion import HUGE
 from drakerock.rocks.materials import calc_spring_stiffness
-from drakerock.rocks.shapes import RockShape
+from drakerock.rocks.shapes import RockShape, load_rock_shapes
 from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
 
 
-def add_rock_bodies(
+@dataclass(frozen=True, eq=False)
+class RockBodies:
+    """The rocks that `AddRockBodies` put into a plant.
+
+    Attributes:
+        pile: the rocks.
+        shapes: their shapes.
+        geometries: the collision geometry of each.
+    """
+
+    pile: PileState
+    shapes: tuple[RockShape, ...]
+    geometries: tuple[GeometryId, ...]
+
+
+def AddRockBodies(
     plant: MultibodyPlant,
     pile: PileState,
-    shapes: tuple[RockShape, ...],
-    rocks: RocksConfig,
-    dynamics: DynamicsConfig,
-) -> list[GeometryId]:
+    rocks: RocksConfig | None = None,
+    config: PlantEngineConfig | None = None,
+    reference_overlap: float = 1e-3,
+    shapes: tuple[RockShape, ...] | None = None,
+) -> RockBodies:
     """Add one body per rock to `plant` (before Finalize); all fixed rocks are on one that is welded to the world.
 
     On the world's own body hundreds of them beside the floor, a half-space whose box has no bounds, make Drake read
     stray memory (1.58: a segmentation fault when they are registered).
 
+    Args:
+        plant: not finalized, with a SceneGraph.
+        pile: the rocks; they start there.
+        rocks: shapes and material.
+        config: contact model.
+        reference_overlap: at which the contact stiffness is taken [m].
+        shapes: the rock shapes, if not those of `rocks.shapes`.
+
     Returns:
-        The collision geometry of each rock.
+        What `AddRocks` is to be given as its engine.
+
+    Raises:
+        InputError: the plant is finalized already, or a rock mesh cannot be used.
     """
+    if plant.is_finalized():
+        raise InputError("AddRockBodies: the plant is finalized; add rocks as bodies before Finalize()")
+    rocks, config = rocks or RocksConfig(), config or PlantEngineConfig()
+    shapes = shapes or load_rock_shapes(rocks.shapes)
     instance = plant.AddModelInstance("rocks")
     kinds = {
-        (shape, size): _make_kind(shapes[shape], size, rocks, dynamics)
+        (shape, size): _make_kind(shapes[shape], size, rocks, config, reference_overlap)
         for shape, size in sorted({(int(k), float(s)) for k, s in zip(pile.shape, pile.size, strict=True)})
     }
+    looks = (make_rock_looks(IllustrationProperties), make_rock_looks(PerceptionProperties))
     if pile.fixed.any():
         solid = plant.AddRigidBody("fixed_rocks", instance, SpatialInertia.Zero())
         plant.WeldFrames(plant.world_frame(), solid.body_frame())
@@ -56,18 +96,21 @@ def add_rock_bodies(
     for rock in range(len(pile)):
         inertia, convex, properties = kinds[int(pile.shape[rock]), float(pile.size[rock])]
         name = _name(rock)
-        if pile.fixed[rock]:
-            X_WR = make_pose(pile.q_WRs[rock], pile.p_WRs[rock])
-            body = solid
-        else:
-            X_WR = RigidTransform()
-            body = plant.AddRigidBody(name, instance, inertia)
-        geometries.append(plant.RegisterCollisionGeometry(body, X_WR, convex, name, properties))
-    return geometries
+        X_WR = make_pose(pile.q_WRs[rock], pile.p_WRs[rock])
+        X_BG = X_WR if pile.fixed[rock] else RigidTransform()
+        body = solid if pile.fixed[rock] else plant.AddRigidBody(name, instance, inertia)
+        if not pile.fixed[rock]:
+            plant.SetDefaultFloatingBaseBodyPose(body, X_WR)
+        geometries.append(plant.RegisterCollisionGeometry(body, X_BG, convex, name, properties))
+        look = GeometryInstance(X_BG, convex, f"{name}_look")
+        look.set_illustration_properties(looks[0])
+        look.set_perception_properties(looks[1])
+        plant.RegisterVisualGeometry(body, look)
+    return RockBodies(pile, shapes, tuple(geometries))
 
 
 def _make_kind(
-    shape: RockShape, size: float, rocks: RocksConfig, dynamics: DynamicsConfig
+    shape: RockShape, size: float, rocks: RocksConfig, config: PlantEngineConfig, reference_overlap: float
 ) -> tuple[SpatialInertia, object, ProximityProperties]:
     volume = shape.volume * size**3
     tensor = rocks.density * size**5 * shape.inertia
@@ -77,27 +120,25 @@ def _make_kind(
         RotationalInertia(*np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2]),
     )
     # Drake puts the two bodies' stiffnesses in series.
-    stiffness = calc_spring_stiffness(
-        rocks.elastic_modulus, rocks.poisson_ratio, volume, dynamics.reference_overlap
-    )
+    stiffness = calc_spring_stiffness(rocks.elastic_modulus, rocks.poisson_ratio, volume, reference_overlap)
     properties = ProximityProperties()
     AddContactMaterial(
-        dissipation=dynamics.plant.dissipation,
+        dissipation=config.dissipation,
         point_stiffness=stiffness,
         friction=CoulombFriction(rocks.friction, rocks.friction),
         properties=properties,
     )
-    if dynamics.plant.contact_model == "hydroelastic":
+    if config.contact_model == "hydroelastic":
         AddCompliantHydroelasticProperties(
-            resolution_hint=dynamics.plant.hydroelastic_resolution * size,
-            hydroelastic_modulus=dynamics.plant.hydroelastic_modulus,
+            resolution_hint=config.hydroelastic_resolution * size,
+            hydroelastic_modulus=config.hydroelastic_modulus,
             properties=properties,
         )
     return inertia, make_convex(shape.vertices, shape.name, size), properties
 
 
-class PlantRocks(LeafSystem):
-    """Shows the rocks of a plant by the interface that both engines share (`RockSystem`).
+class PlantRocks(RockSystem):
+    """Shows the rocks that are bodies of a plant.
 
     Input ports:
         ``state``: the plant's whole state.
@@ -109,32 +150,34 @@ class PlantRocks(LeafSystem):
     not survive poses that are not finite. SimulationFailure is raised then.
     """
 
-    def __init__(self, plant: MultibodyPlant, pile: PileState, geometries: list[GeometryId]) -> None:
-        """Make the view of `pile`'s rocks in the finalized `plant`; `geometries` as `add_rock_bodies` gave."""
-        super().__init__()
-        self.set_name("rocks")
-        self._plant = plant
-        self._pile = pile
+    def __init__(self, plant: MultibodyPlant, bodies: RockBodies, touching: tuple[BodyIndex, ...]) -> None:
+        """Make the view of the rocks `bodies` in the finalized `plant`; `touching` bodies may meet them."""
+        pile = bodies.pile
+        super().__init__(plant, pile, bodies.shapes, touching)
         self._free = np.flatnonzero(~pile.fixed)
-        bodies = [plant.GetBodyByName(_name(int(rock))) for rock in self._free]
-        self._q = np.array([body.floating_positions_start() for body in bodies], int)
+        free = [plant.GetBodyByName(_name(int(rock))) for rock in self._free]
+        self._q = np.array([body.floating_positions_start() for body in free], int)
         self._v = (
-            np.array([body.floating_velocities_start_in_v() for body in bodies], int) + plant.num_positions()
+            np.array([body.floating_velocities_start_in_v() for body in free], int) + plant.num_positions()
         )
-        self._rock_geometries = frozenset(geometries)
-        self._bucket = plant.GetBodyByName("bucket") if plant.HasBodyNamed("bucket") else None
-        self._bucket_geometries = frozenset(
-            plant.GetCollisionGeometriesForBody(self._bucket) if self._bucket else ()
-        )
+        # By the ids' values: ids from the plant would keep the Diagram alive (`drakerock.memory`).
+        self._rock_of = {geometry.get_value(): rock for rock, geometry in enumerate(bodies.geometries)}
+        self._number = {int(index): k for k, index in enumerate(touching)}
+        self._body_of = {
+            geometry.get_value(): int(index)
+            for index in map(BodyIndex, range(plant.num_bodies()))
+            for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(index))
+        }
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
-        self._contacts = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
-        self._machine_poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
-        n = len(pile)
-        state_only = {self._state.ticket()}
-        self.DeclareVectorOutputPort("rock_poses", 7 * n, self._calc_poses, state_only)
-        self.DeclareVectorOutputPort("rock_velocities", 6 * n, self._calc_velocities, state_only)
-        self.DeclareVectorOutputPort("rock_summary", len(ROCK_SUMMARY), self._calc_summary)
-        self.DeclareVectorOutputPort("F_B_W", 6, self._calc_bucket_force)
+        self._results = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
+        self._body_poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
+        report = self.DeclareDiscreteState(np.zeros(len(ROCK_SUMMARY) + 6 * len(touching)))
+        self._report = report
+        self._declare_outputs(self.discrete_state_ticket(report), self._state.ticket())
+        self.DeclareAbstractOutputPort(
+            "contacts", lambda: Value[object](make_empty_contacts()), weak(self._calc_contacts)
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(plant.time_step(), 0.0, self._update)
         # Publish events come in the order of the systems: this one before those of the logs.
         self.DeclarePerStepPublishEvent(self._check)
 
@@ -149,87 +192,91 @@ class PlantRocks(LeafSystem):
         state[self._q[:, None] + np.arange(7)] = np.hstack([pile.q_WRs, pile.p_WRs])[self._free]
         state[self._v[:, None] + np.arange(6)] = pile.V_WRs[self._free]
         self._plant.SetPositionsAndVelocities(context, state)
-
-    def get_pile(self, root_context: Context) -> PileState:
-        """Read the rocks' present state."""
-        state = self._plant.GetPositionsAndVelocities(self._plant.GetMyContextFromRoot(root_context))
-        poses, velocities = self._gather(state)
-        return PileState(
-            p_WRs=poses[:, 4:],
-            q_WRs=poses[:, :4] / np.linalg.norm(poses[:, :4], axis=1)[:, None],
-            V_WRs=velocities,
-            shape=self._pile.shape,
-            size=self._pile.size,
-            fixed=self._pile.fixed,
-            provenance=dict(self._pile.provenance),
+        own = self.GetMyMutableContextFromRoot(root_context)
+        own.get_mutable_discrete_state(self._report).SetFromVector(
+            np.zeros(len(ROCK_SUMMARY) + 6 * len(self._bodies))
         )
 
-    def _gather(self, state: Array) -> tuple[Array, Array]:
-        poses = np.hstack([self._pile.q_WRs, self._pile.p_WRs])
-        velocities = np.zeros((len(self._pile), 6))
-        poses[self._free] = state[self._q[:, None] + np.arange(7)]
-        velocities[self._free] = state[self._v[:, None] + np.arange(6)]
-        return poses, velocities
+    def get_pile(self, root_context: Context) -> PileState:
+        """Read the rocks' present state; this engine keeps no contacts."""
+        return self._make_pile(
+            self._plant.GetPositionsAndVelocities(self._plant.GetMyContextFromRoot(root_context))
+        )
 
-    def _calc_poses(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._gather(self._state.Eval(context))[0].ravel())
+    def _read_pile(self, context: Context) -> PileState:
+        return self._make_pile(self._state.Eval(context))
 
-    def _calc_velocities(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._gather(self._state.Eval(context))[1].ravel())
+    def _make_pile(self, state: Array) -> PileState:
+        pile = self._default_pile
+        q_WRs, p_WRs, V_WRs = pile.q_WRs.copy(), pile.p_WRs.copy(), np.zeros((len(pile), 6))
+        poses = state[self._q[:, None] + np.arange(7)]
+        q_WRs[self._free] = poses[:, :4] / np.linalg.norm(poses[:, :4], axis=1)[:, None]
+        p_WRs[self._free] = poses[:, 4:]
+        V_WRs[self._free] = state[self._v[:, None] + np.arange(6)]
+        return replace(pile, p_WRs=p_WRs, q_WRs=q_WRs, V_WRs=V_WRs, contacts=None)
 
-    def _calc_summary(self, context: Context, output: BasicVector) -> None:
-        results = self._contacts.Eval(context)
-        depths = [
-            results.point_pair_contact_info(k).point_pair().depth
-            for k in range(results.num_point_pair_contacts())
-        ]
-        count = len(depths) + results.num_hydroelastic_contacts()
-        depth_max, depth_99 = (max(depths), float(np.percentile(depths, 99))) if depths else (0.0, 0.0)
-        output.SetFromVector([len(self._free), count, depth_max, depth_99, 0.0, 0.0, 0.0])
+    def _read_report(self, context: Context) -> Array:
+        return np.array(context.get_discrete_state(self._report).value())
 
-    def _calc_bucket_force(self, context: Context, output: BasicVector) -> None:
-        total = np.zeros(6)
-        if self._bucket is not None:
-            results = self._contacts.Eval(context)
-            p_WB = self._machine_poses.Eval(context)[int(self._bucket.index())].translation()
-            for k in range(results.num_point_pair_contacts()):
-                info = results.point_pair_contact_info(k)
-                pair = info.point_pair()
-                # contact_force() is the force on body B.
-                side = self._find_side(pair.id_B, pair.id_A)
-                if side:
-                    force = side * info.contact_force()
-                    total += np.concatenate([np.cross(info.contact_point() - p_WB, force), force])
-            for k in range(results.num_hydroelastic_contacts()):
-                info = results.hydroelastic_contact_info(k)
-                surface = info.contact_surface()
-                # F_Ac_W() is the force on the body of geometry M, at the surface's centroid.
-                side = self._find_side(surface.id_M(), surface.id_N())
-                if not side:
-                    continue
-                force = side * info.F_Ac_W().translational()
-                arm = surface.centroid() - p_WB
-                total += np.concatenate([side * info.F_Ac_W().rotational() + np.cross(arm, force), force])
-        output.SetFromVector(total)
+    def _update(self, context: Context, discrete: DiscreteValues) -> EventStatus:
+        found = self._find_contacts(context)
+        depths = found.depth
+        deepest, depth_99 = (
+            (float(depths.max()), float(np.percentile(depths, 99))) if len(found) else (0.0, 0.0)
+        )
+        forces = np.zeros((len(self._bodies), 6))
+        poses = self._body_poses.Eval(context)
+        for k in np.flatnonzero(found.body >= 0):
+            number = self._number.get(int(found.body[k]))
+            if number is not None:
+                f, arm = found.f_WCs[k], found.p_WCs[k] - poses[int(found.body[k])].translation()
+                forces[number] += np.concatenate([found.t_WCs[k] + np.cross(arm, f), f])
+        summary = [len(self._free), len(found), deepest, depth_99, 0.0, 0.0, 0.0]
+        discrete.get_mutable_vector(self._report).SetFromVector([*summary, *forces.ravel()])
+        return EventStatus.Succeeded()
 
-    def _find_side(self, first: GeometryId, second: GeometryId) -> float:
-        """Return 1 if `first` is the bucket and `second` a rock, -1 the other way round, else 0."""
-        if first in self._bucket_geometries and second in self._rock_geometries:
-            return 1.0
-        if second in self._bucket_geometries and first in self._rock_geometries:
-            return -1.0
-        return 0.0
+    def _calc_contacts(self, context: Context, output: Value) -> None:
+        output.set_value(self._find_contacts(context))
 
+    def _find_contacts(self, context: Context) -> RockContacts:
+        """Return the contacts of rocks over the coming step; a hydroelastic surface is a point at its centroid."""
+        results = self._results.Eval(context)
+        rows: list[tuple[int, int, int, Array, Array, Array, float]] = []
+        for k in range(results.num_point_pair_contacts()):
+            info = results.point_pair_contact_info(k)
+            pair = info.point_pair()
+            # contact_force() is the force on body B.
+            force = np.concatenate([np.zeros(3), info.contact_force()])
+            self._add_row(rows, pair.id_A, pair.id_B, info.contact_point(), force, pair.depth)
+        for k in range(results.num_hydroelastic_contacts()):
+            info = results.hydroelastic_contact_info(k)
+            surface = info.contact_surface()
+            # F_Ac_W() is the force on the body of geometry M, at the surface's centroid.
+            force = np.concatenate([info.F_Ac_W().rotational(), info.F_Ac_W().translational()])
+            self._add_row(rows, surface.id_N(), surface.id_M(), surface.centroid(), force, 0.0)
+        if not rows:
+            return make_empty_contacts()
+        return RockContacts(*(np.array(column) for column in zip(*rows, strict=True)))
 
-def add_plant_rocks(
-    builder: DiagramBuilder, plant: MultibodyPlant, pile: PileState, geometries: list[GeometryId]
-) -> PlantRocks:
-    """Add the view of the rocks that `add_rock_bodies` put into the plant, and connect it (after Finalize)."""
-    system = builder.AddSystem(PlantRocks(plant, pile, geometries))
-    builder.Connect(plant.get_state_output_port(), system.GetInputPort("state"))
-    builder.Connect(plant.get_contact_results_output_port(), system.GetInputPort("contact_results"))
-    builder.Connect(plant.get_body_poses_output_port(), system.GetInputPort("body_poses"))
-    return system
+    def _add_row(
+        self,
+        rows: list[tuple[int, int, int, Array, Array, Array, float]],
+        first: GeometryId,
+        second: GeometryId,
+        p_WC: Array,
+        force: Array,
+        depth: float,
+    ) -> None:
+        """Add a contact with spatial force (6,) on the second, if a rock has part in it."""
+        rock, other = self._rock_of.get(first.get_value()), self._rock_of.get(second.get_value())
+        if rock is None:
+            first, second, rock, other, force = second, first, other, rock, -force
+        if rock is None:
+            return
+        body = -1 if other is not None else self._body_of[second.get_value()]
+        if body >= 0 and body not in self._number:
+            body = 0
+        rows.append((rock, -1 if other is None else other, body, p_WC, force[3:], force[:3], depth))
 
 
 def _name(rock: int) -> str:

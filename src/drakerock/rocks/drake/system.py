@@ -1,36 +1,33 @@
-"""The nonsmooth rock engine as a LeafSystem, and its wiring to the machine's plant.
+"""The nonsmooth rock engine as a LeafSystem.
 
 The system holds no physics of its own: its state is the engine's arrays, its update is the engine's step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
-from pydrake.geometry import SceneGraph
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import (
     BasicVector,
     Context,
-    DiagramBuilder,
     DiscreteValues,
-    LeafSystem,
+    EventStatus,
     ValueProducer,
 )
 
-from drakerock.lhd.model import Machine
-from drakerock.rocks.config import RocksConfig
-from drakerock.rocks.drake.coupling import MachineLayout, MachineView, make_machine_layout
-from drakerock.rocks.drake.interface import ROCK_SUMMARY
-from drakerock.rocks.engine.config import DynamicsConfig
+from drakerock.errors import InputError
+from drakerock.memory import weak
+from drakerock.rocks.drake.geometry import PlantGeometry
+from drakerock.rocks.drake.interface import ROCK_SUMMARY, RockContacts, RockSystem, make_empty_contacts
 from drakerock.rocks.engine.contact_cache import ContactCache, make_contact_cache
 from drakerock.rocks.engine.engine import (
+    MachineStep,
     NonsmoothEngine,
     RockArrays,
     StepReport,
@@ -38,10 +35,12 @@ from drakerock.rocks.engine.engine import (
 )
 from drakerock.rocks.engine.records import CACHED_POINT, SLEEP
 from drakerock.rocks.shapes import RockShape
-from drakerock.rocks.site import Site
 from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
+
+# A body of the plant that starts so deep in a rock starts inside the pile [m].
+START_PENETRATION = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,73 +52,81 @@ class _Step:
     room: RockArrays
 
 
-class NonsmoothRocks(LeafSystem):
-    """All rocks of a pile, stepped by the nonsmooth engine (`RockSystem`).
+class NonsmoothRocks(RockSystem):
+    """All rocks of a pile, stepped by the nonsmooth engine.
 
     One solve per step: a cache entry computed from the state at t_n, read by the discrete update and by
-    ``spatial_forces`` alike. ``rock_summary`` and ``F_B_W`` are state, so that reading them solves nothing: they
-    belong to the step taken last. A log's row at t_n is written before the update at t_n, so it holds the step that
-    ended there; `drakerock.loading.signals` moves it to the step's beginning. All state is discrete and numeric,
-    the contact cache and the bookkeeping of sleeping rocks included, so a context can be saved, restored and
-    repeated bit for bit. The engine's scratch memory is shared by all contexts: one thread at a time.
+    ``applied_spatial_force`` alike. All state is discrete and numeric, the contact cache and the bookkeeping of
+    sleeping rocks included, so a context can be saved, restored and repeated bit for bit. The engine's scratch memory
+    is shared by all contexts: one thread at a time.
 
-    Input port:
-        ``machine_step``: a `MachineStep`; without a machine the port need not be connected.
+    When a Diagram is initialised, a body of the plant that starts inside the pile is an InputError.
 
-    Output ports:
-        those of `RockSystem`: ``rock_poses``, ``rock_velocities``, ``rock_summary``, ``F_B_W``.
-        ``spatial_forces``: list of ExternallyAppliedSpatialForce, the rocks' forces on the machine's bodies over
-            the coming step, for the plant's applied-spatial-force port.
-        ``rock_status``: (n,) 0 awake, 1 resting, 2 fixed, 3 lost.
+    Input ports:
+        ``plant_step``: a `MachineStep`; in a plant where nothing moves it need not be connected.
+        ``applied_spatial_force``: list of ExternallyAppliedSpatialForce, of others on the plant's bodies; may be left
+            open.
+
+    Output ports: those of `RockSystem`, and
+        ``applied_spatial_force``: list of ExternallyAppliedSpatialForce for the plant: the rocks' forces on its bodies
+            over the coming step, then those of others.
+        ``status``: (n,) 0 awake, 1 resting, 2 fixed, 3 lost.
     """
 
     def __init__(
         self,
+        plant: MultibodyPlant,
         engine: NonsmoothEngine,
         pile: PileState,
-        layout: MachineLayout | None = None,
-        body_indices: Sequence[BodyIndex] = (),
+        shapes: tuple[RockShape, ...],
+        geometry: PlantGeometry,
     ) -> None:
         """Make the system.
 
         Args:
-            engine: made for the rocks of `pile`.
+            plant: the finalized plant.
+            engine: made for the rocks of `pile` and what they meet in the plant.
             pile: their state in a default context.
-            layout: the machine's bodies that touch rocks, if there is a machine.
-            body_indices: of these bodies in the plant.
+            shapes: the rock shapes.
+            geometry: of the plant.
         """
-        super().__init__()
-        self.set_name("rocks")
+        super().__init__(plant, pile, shapes, geometry.bodies)
         self._engine = engine
-        self._layout = layout
-        self._body_indices = list(body_indices)
         self._provenance = dict(pile.provenance)
         n = engine.n_rocks
-        arrays = engine.make_arrays(pile)
-        values = _flatten(arrays)
+        n_bodies = len(geometry.bodies)
+        values = self._flatten(engine.make_arrays(pile))
         # Room for more points than there are: `counts` tells how many points of the cache count, and the like.
         for name, flat in _flatten_cache(make_contact_cache(engine.capacity)).items():
             values[name] = np.pad(values[name], (0, len(flat) - len(values[name])))
+        values["report"] = np.zeros(len(ROCK_SUMMARY) + 6 * n_bodies)
         self._groups = {name: self.DeclareDiscreteState(flat) for name, flat in values.items()}
-        self._machine = self.DeclareAbstractInputPort("machine_step", Value[object](make_machineless_step()))
+        self._plant_step = self.DeclareAbstractInputPort("plant_step", Value[object](make_machineless_step()))
+        self._others = self.DeclareAbstractInputPort(
+            "applied_spatial_force", Value[list[ExternallyAppliedSpatialForce]]([])
+        )
         step = self.DeclareCacheEntry(
             "step",
-            ValueProducer(allocate=self._make_step, calc=self._calc_step),
-            {self.xd_ticket(), self._machine.ticket()},
+            ValueProducer(allocate=weak(self._make_step), calc=weak(self._calc_step)),
+            {self.xd_ticket(), self._plant_step.ticket()},
         )
-        self._step = step
-        state_only = {self.xd_ticket()}
-        self.DeclareVectorOutputPort("rock_poses", 7 * n, self._calc_poses, state_only)
-        self.DeclareVectorOutputPort("rock_velocities", 6 * n, self._calc_velocities, state_only)
-        self.DeclareVectorOutputPort("rock_status", n, self._calc_status, state_only)
-        self.DeclareVectorOutputPort("rock_summary", len(ROCK_SUMMARY), self._calc_summary, state_only)
-        self.DeclareVectorOutputPort("F_B_W", 6, self._calc_bucket_force, state_only)
+        self._step = step.cache_index()
+        state = self.xd_ticket()
+        self._declare_outputs(self.discrete_state_ticket(self._groups["report"]), state)
+        self.DeclareVectorOutputPort("status", n, self._calc_status, {state})
         self.DeclareAbstractOutputPort(
-            "spatial_forces",
-            lambda: Value[list[ExternallyAppliedSpatialForce]]([]),
-            self._calc_spatial_forces,
+            "contacts",
+            lambda: Value[object](make_empty_contacts()),
+            weak(self._calc_contacts),
             {step.ticket()},
         )
+        self.DeclareAbstractOutputPort(
+            "applied_spatial_force",
+            lambda: Value[list[ExternallyAppliedSpatialForce]]([]),
+            weak(self._calc_applied_force),
+            {step.ticket(), self._others.ticket()},
+        )
+        self.DeclareInitializationPublishEvent(self._check_start)
         self.DeclarePeriodicDiscreteUpdateEvent(engine.time_step, 0.0, self._update)
 
     @property
@@ -134,7 +141,10 @@ class NonsmoothRocks(LeafSystem):
             ValueError: not the rocks this system was made for.
         """
         context = self.GetMyMutableContextFromRoot(root_context)
-        self._write(context.get_mutable_discrete_state(), _flatten(self._engine.make_arrays(pile)))
+        discrete = context.get_mutable_discrete_state()
+        for name, flat in self._flatten(self._engine.make_arrays(pile)).items():
+            discrete.get_mutable_value(self._groups[name])[: len(flat)] = flat
+        discrete.get_mutable_value(self._groups["report"])[:] = 0.0
 
     def get_pile(self, root_context: Context) -> PileState:
         """Read the rocks' present state, contacts included, from the Diagram's context."""
@@ -163,28 +173,38 @@ class NonsmoothRocks(LeafSystem):
             ContactCache(state["pairs"].view(np.int32).reshape(-1, 2), state["points"].view(CACHED_POINT)),
         )
 
-    def _write(self, discrete: DiscreteValues, values: dict[str, Array]) -> None:
-        for name, flat in values.items():
-            discrete.get_mutable_value(self._groups[name])[: len(flat)] = flat
+    def _flatten(self, arrays: RockArrays) -> dict[str, Array]:
+        return {
+            "quaternions": arrays.quaternions.reshape(-1),
+            "positions": arrays.positions.reshape(-1),
+            "velocities": arrays.velocities.reshape(-1),
+            "sleep": arrays.sleep.view(float),
+            **_flatten_cache(arrays.cache),
+            "counts": _count(arrays),
+        }
 
     def _make_step(self) -> Value:
         room = self._engine.make_room()
         return Value[object](_Step(room, None, room))
 
+    def _read_plant_step(self, context: Context) -> MachineStep:
+        if self._plant_step.HasValue(context):
+            return self._plant_step.Eval(context)
+        return make_machineless_step()
+
     def _calc_step(self, context: Context, value: Value) -> None:
-        machine = self._machine.Eval(context) if self._machine.HasValue(context) else make_machineless_step()
         room = value.get_value().room
-        value.set_value(_Step(*self._engine.step(self._get_arrays(context), machine, room), room))
+        plant_step = self._read_plant_step(context)
+        value.set_value(_Step(*self._engine.step(self._get_arrays(context), plant_step, room), room))
 
     def _solve(self, context: Context) -> tuple[RockArrays, StepReport]:
-        step: _Step = self._step.Eval(context)
+        step: _Step = self.get_cache_entry(self._step).Eval(context)
         assert step.report is not None
         return step.arrays, step.report
 
     def _update(self, context: Context, discrete: DiscreteValues) -> None:
         arrays, report = self._solve(context)
-        last = context.get_discrete_state(self._groups["report"]).value()
-        F_B_W = np.zeros(6) if self._layout is None else report.F_Bs_W[self._layout.bucket]
+        last = self._read_report(context)
         values = {
             "n_awake": report.n_awake,
             "n_contacts": report.n_contacts,
@@ -199,34 +219,73 @@ class NonsmoothRocks(LeafSystem):
         state = {name: discrete.get_mutable_value(group) for name, group in self._groups.items()}
         self._engine.write_changes(arrays, report, self._view(state))
         state["counts"][:] = _count(arrays)
-        state["report"][:] = [*summary, *F_B_W]
+        state["report"][:] = np.concatenate([summary, report.F_Bs_W.reshape(-1)])
 
-    def _calc_poses(self, context: Context, output: BasicVector) -> None:
-        arrays = self._get_arrays(context)
-        output.SetFromVector(np.hstack([arrays.quaternions, arrays.positions]).reshape(-1))
+    def _check_start(self, context: Context) -> EventStatus:
+        found = self._find_contacts(context)
+        moving = found.body > 0
+        if moving.any():
+            k = int(np.argmax(np.where(moving, found.depth, -np.inf)))
+            if found.depth[k] > START_PENETRATION:
+                body = self._plant.get_body(BodyIndex(int(found.body[k])))
+                raise InputError(
+                    f"body '{body.scoped_name()}' starts {found.depth[k]:.2f} m inside a rock at "
+                    f"{np.round(found.p_WCs[k], 2).tolist()}: place it outside the pile before the simulation starts"
+                )
+        return EventStatus.Succeeded()
 
-    def _calc_velocities(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._get_arrays(context).velocities.reshape(-1))
+    def _find_contacts(self, context: Context) -> RockContacts:
+        """Return the contacts of the coming step; it is solved once more, for these alone."""
+        table = self._engine.find_loaded_contacts(self._get_arrays(context), self._read_plant_step(context))
+        n = self._engine.n_rocks
+        first_piece = self._engine.first_piece
+        bodies = np.array([int(index) for index in self._bodies], np.int64)
+        on_rock, on_piece = table.second < n, table.second >= first_piece
+        number = np.zeros(len(table.second), np.int64)
+        if len(bodies):
+            piece_body = bodies[self._engine.piece_body]
+            number[on_piece] = piece_body[table.second[on_piece] - first_piece]
+        return RockContacts(
+            rock=table.first,
+            other=np.where(on_rock, table.second, -1),
+            body=np.where(on_rock, -1, number),
+            p_WCs=table.points,
+            f_WCs=table.impulses / self._engine.time_step,
+            t_WCs=np.zeros_like(table.impulses),
+            depth=-table.gaps,
+        )
+
+    def _read_pile(self, context: Context) -> PileState:
+        arrays, pile = self._get_arrays(context), self._default_pile
+        return replace(
+            pile,
+            p_WRs=arrays.positions.copy(),
+            q_WRs=arrays.quaternions.copy(),
+            V_WRs=arrays.velocities.copy(),
+            contacts=None,
+        )
+
+    def _read_report(self, context: Context) -> Array:
+        return np.array(context.get_discrete_state(self._groups["report"]).value())
 
     def _calc_status(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._get_arrays(context).status)
 
-    def _calc_summary(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._groups["report"]).value()[: len(ROCK_SUMMARY)])
+    def _calc_contacts(self, context: Context, output: Value) -> None:
+        output.set_value(self._find_contacts(context))
 
-    def _calc_bucket_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._groups["report"]).value()[len(ROCK_SUMMARY) :])
-
-    def _calc_spatial_forces(self, context: Context, output: Value) -> None:
+    def _calc_applied_force(self, context: Context, output: Value) -> None:
         _, report = self._solve(context)
         forces = []
-        for index, F_B_W in zip(self._body_indices, report.F_Bs_W, strict=True):
+        for index, F_B_W in zip(self._bodies, report.F_Bs_W, strict=True):
             if F_B_W.any():
                 force = ExternallyAppliedSpatialForce()
                 force.body_index = index
                 force.p_BoBq_B = np.zeros(3)
                 force.F_Bq_W = SpatialForce(F_B_W[:3], F_B_W[3:])
                 forces.append(force)
+        if self._others.HasValue(context):
+            forces += self._others.Eval(context)
         output.set_value(forces)
 
 
@@ -238,61 +297,6 @@ def _count(arrays: RockArrays) -> Array:
     return np.array([len(arrays.cache.pairs), arrays.n_sleeping, arrays.steps], float)
 
 
-def _flatten(arrays: RockArrays) -> dict[str, Array]:
-    return {
-        "quaternions": arrays.quaternions.reshape(-1),
-        "positions": arrays.positions.reshape(-1),
-        "velocities": arrays.velocities.reshape(-1),
-        "sleep": arrays.sleep.view(float),
-        **_flatten_cache(arrays.cache),
-        "counts": _count(arrays),
-        "report": np.zeros(len(ROCK_SUMMARY) + 6),
-    }
-
-
 def _flatten_cache(cache: ContactCache) -> dict[str, Array]:
     # Bits, two numbers in one.
     return {"pairs": cache.pairs.reshape(-1).view(np.float64), "points": cache.points.view(np.float64)}
-
-
-def add_nonsmooth_rocks(
-    builder: DiagramBuilder,
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    machine: Machine,
-    site: Site,
-    shapes: tuple[RockShape, ...],
-    rocks: RocksConfig,
-    dynamics: DynamicsConfig,
-    pile: PileState,
-) -> tuple[NonsmoothRocks, MachineView]:
-    """Add the rocks and their coupling to the machine, and connect both ways (after Finalize).
-
-    Args:
-        builder: of the Diagram that holds `plant` and `scene_graph`.
-        plant, scene_graph: the finalized plant, with machine and site.
-        machine: the machine in it.
-        site, shapes, rocks: where and what the rocks are.
-        dynamics: settings; its time step is the plant's.
-        pile: the rocks.
-
-    Returns:
-        the rocks, and the machine's view, whose input ``desired_state`` is left to be connected to what the
-        plant's desired-state port of the machine gets.
-    """
-    config = dynamics.nonsmooth
-    layout = make_machine_layout(
-        plant, scene_graph, machine, config.rest.sensor_length, config.rest.sensor_margin
-    )
-    engine = NonsmoothEngine(
-        rocks, shapes, site, config, dynamics.time_step, pile.shape, pile.size, pile.fixed,
-        layout.pieces, len(layout.bodies),
-    )  # fmt: skip
-    indices = [plant.GetBodyByName(name, machine.instance).index() for name in layout.bodies]
-    system = builder.AddSystem(NonsmoothRocks(engine, pile, layout, indices))
-    view = builder.AddSystem(MachineView(plant, machine, layout, dynamics.stiction_tolerance))
-    builder.Connect(plant.get_state_output_port(), view.GetInputPort("state"))
-    builder.Connect(scene_graph.get_query_output_port(), view.GetInputPort("geometry_query"))
-    builder.Connect(view.GetOutputPort("machine_step"), system.GetInputPort("machine_step"))
-    builder.Connect(system.GetOutputPort("spatial_forces"), plant.get_applied_spatial_force_input_port())
-    return system, view

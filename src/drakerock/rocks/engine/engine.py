@@ -20,7 +20,7 @@ from drakerock.errors import SimulationFailure
 from drakerock.rocks.config import RocksConfig
 from drakerock.rocks.engine import contact_cache, motion, sleeping
 from drakerock.rocks.engine.collision.detection import ContactDetection, SiteBox
-from drakerock.rocks.engine.collision.narrow_phase import Surroundings
+from drakerock.rocks.engine.collision.narrow_phase import CollisionGeometry
 from drakerock.rocks.engine.collision.persistence import choose_search_modes
 from drakerock.rocks.engine.collision.poses import CollisionBodies
 from drakerock.rocks.engine.collision.shapes import make_convex_shapes
@@ -42,18 +42,20 @@ from drakerock.rocks.engine.solve.rows import (
 from drakerock.rocks.engine.solve.spin_damping import damp_spin
 from drakerock.rocks.engine.state import (
     MOTION,
+    ContactTable,
     MachinePiece,
     MachineStep,
     RockArrays,
     StepReport,
     make_machineless_step,
 )
+from drakerock.rocks.engine.surroundings import Surroundings
 from drakerock.rocks.materials import calc_spring_stiffness
 from drakerock.rocks.shapes import RockShape
-from drakerock.rocks.site import Site
 from drakerock.rocks.state import ContactMemory, PileState
 
 __all__ = [
+    "ContactTable",
     "MachinePiece",
     "MachineStep",
     "NonsmoothEngine",
@@ -65,12 +67,12 @@ __all__ = [
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Acceleration of free fall [m/s^2], along -z.
-GRAVITY = 9.81
+# Drake's default [m/s^2].
+GRAVITY = (0.0, 0.0, -9.81)
+# Where there is no gravity, impulses are measured by this [m/s^2].
+STANDARD_GRAVITY = 9.81
 # Quaternions are taken for unit ones within this, and keep their bits.
 UNIT_TOLERANCE = 1e-14
-# How far outside the site's box a rock still counts as inside [m].
-SITE_MARGIN = 0.5
 # A step that failed is solved again with this many times the iterations and without acceleration, from a cold start
 # if need be; one that begins with an overlap beyond this share of the bound has as many at once. A light rock that
 # the machine presses into a jammed pile passes on little of the machine's momentum per iteration, and is squeezed
@@ -100,25 +102,25 @@ class _Solution(NamedTuple):
 
 
 class NonsmoothEngine:
-    """Steps a given set of rocks on a given site, with the pieces of a machine if there is one.
+    """Steps a given set of rocks in given surroundings, with the pieces of a machine if there is one.
 
     Args:
         rocks: material.
-        shapes: the scenario's rock shapes.
-        site: planes and convex pieces.
+        shapes: the rock shapes.
+        surroundings: what is at rest.
         config: settings.
         time_step: [s].
         shape, size, fixed: (n,) of the rocks, as in a `PileState`.
         pieces: the machine's.
         n_machine_bodies: number of machine bodies.
-        gravity: [m/s^2], along -z.
+        gravity: (3,) in W [m/s^2].
     """
 
     def __init__(
         self,
         rocks: RocksConfig,
         shapes: Sequence[RockShape],
-        site: Site,
+        surroundings: Surroundings,
         config: NonsmoothConfig,
         time_step: float,
         shape: IntArray,
@@ -126,7 +128,7 @@ class NonsmoothEngine:
         fixed: NDArray[np.bool_],
         pieces: Sequence[MachinePiece] = (),
         n_machine_bodies: int = 0,
-        gravity: float = GRAVITY,
+        gravity: Sequence[float] = GRAVITY,
     ) -> None:
         announce_compilation()
         self.config = config
@@ -135,15 +137,19 @@ class NonsmoothEngine:
         self.shape_index = np.asarray(shape, np.int64)
         self.size = np.asarray(size, float)
         self.fixed = np.asarray(fixed, bool)
-        self.gravity = gravity
-        n_shapes, n_static, n_planes = len(shapes), len(site.pieces), len(site.planes)
+        self.gravity = np.asarray(gravity, float)
+        # What impulses are measured by.
+        self._strength = float(np.linalg.norm(self.gravity)) or STANDARD_GRAVITY
+        n_shapes, n_static, n_planes = (
+            len(shapes), len(surroundings.pieces), len(surroundings.half_spaces),
+        )  # fmt: skip
         self.convex = make_convex_shapes(
             [item.vertices for item in shapes]
-            + [item.vertices for item in site.pieces]
+            + [item.vertices for item in surroundings.pieces]
             + [item.vertices for item in pieces],
             [config.rounding] * n_shapes + [0.0] * (n_static + len(pieces)),
         )
-        self.planes = np.array([[*plane.normal, plane.offset] for plane in site.planes], float).reshape(-1, 4)
+        self.planes = surroundings.half_space_array
 
         # Bodies: rocks, static pieces, planes, pieces of the machine.
         self.first_plane = n + n_static
@@ -158,8 +164,10 @@ class NonsmoothEngine:
         shape[self.first_piece :] = n_shapes + n_static + np.arange(len(pieces))
         scale = np.ones(n_bodies)
         scale[:n] = self.size
-        friction = np.full(n_bodies, site.config.friction)
+        friction = np.empty(n_bodies)
         friction[:n] = rocks.friction
+        friction[n : self.first_plane] = [piece.friction for piece in surroundings.pieces]
+        friction[self.first_plane : self.first_piece] = [plane.friction for plane in surroundings.half_spaces]
         friction[self.first_piece :] = [piece.friction for piece in pieces]
         solver_body = np.full(n_bodies, n, np.int64)
         solver_body[:n] = np.arange(n)
@@ -196,7 +204,7 @@ class NonsmoothEngine:
         else:
             self.contact_compliance[:n] = 1.0 / self.size
 
-        self._lower_site, self._upper_site = _calc_site_box(site)
+        self._lower_site, self._upper_site = surroundings.lower, surroundings.upper
         self._make_scratch(n_bodies)
 
     def _make_scratch(self, n_bodies: int) -> None:
@@ -204,7 +212,9 @@ class NonsmoothEngine:
         self.capacity = self.config.memory_per_rock * n + 1024
         self.detection = ContactDetection(
             self._collision_bodies,
-            Surroundings(n, self.first_plane, self.first_piece, self.planes, self.convex, self.restitution),
+            CollisionGeometry(
+                n, self.first_plane, self.first_piece, self.planes, self.convex, self.restitution
+            ),
             self.piece_body,
             self.radius,
             self.inverse_inertia_local,
@@ -405,6 +415,19 @@ class NonsmoothEngine:
             )
         return _mark_redone(result)
 
+    def find_loaded_contacts(self, arrays: RockArrays, machine: MachineStep) -> ContactTable:
+        """Return the contact points that carry load in the coming step; arguments and errors as of `step`."""
+        _, report = self.step(arrays, machine)
+        rows, n_rows = self.detection.rows, report.n_contacts
+        loaded = rows.values["impulse"][:n_rows, 0] > 0.0
+        values, keys = rows.values[:n_rows][loaded], rows.key[:n_rows][loaded]
+        first, second = keys // KEY_STEP, keys % KEY_STEP
+        axes = np.stack([values["normal"], values["tangent_1"], values["tangent_2"]], axis=1)
+        impulses = np.einsum("kij,ki->kj", axes, values["impulse"])
+        # A row's arms are from where the bodies were when the step began.
+        points = arrays.positions[first] + values["arm_a"]
+        return ContactTable(first, second, points, impulses, values["gap"].copy())
+
     def _has_converged(
         self, result: tuple[RockArrays, StepReport] | None
     ) -> TypeGuard[tuple[RockArrays, StepReport]]:
@@ -489,7 +512,7 @@ class NonsmoothEngine:
         rest, dt = self.config.rest, self.time_step
         self._mark_by_movers(new.sleep, arrays.velocities, arrays.cache, arrays.n_sleeping)
         thresholds = sleeping.WakeThresholds(
-            rest.wake_load * self.gravity * dt, rest.wake_share, rest.wake_near_movers, rest.wake_steps
+            rest.wake_load * self._strength * dt, rest.wake_share, rest.wake_near_movers, rest.wake_steps
         )
         n_woken = sleeping.wake(
             arrays.positions, self.radius, self.mass, arrays.cache, arrays.n_sleeping, sensors, self._by_movers,
@@ -585,11 +608,11 @@ class NonsmoothEngine:
             )  # fmt: skip
         if config.spin_damping > 0.0:
             damp_spin(n_rows, rows, config.spin_damping * dt, self._bodies)
-        motion.add_gravity(awake, np.array([0.0, 0.0, -self.gravity * dt]), self._bodies)
+        motion.add_gravity(awake, self.gravity * dt, self._bodies)
         velocity += machine.free_change
         residual = solve_contacts(
             n_rows, awake, IterationSettings(iterations, config.machine_sweeps, attempt.acceleration),
-            float(self.mass[awake].sum()) * self.gravity * dt, rows, self._bodies, machine.arrays, velocity,
+            float(self.mass[awake].sum()) * self._strength * dt, rows, self._bodies, machine.arrays, velocity,
             self._batches, self._single_bodies, self._marks,
         )  # fmt: skip
         return _Solution(velocity, iterations, residual, n_impacts > 0)
@@ -606,13 +629,3 @@ def _calc_percentile(values: Array, share: float) -> float:
         return 0.0
     place = min(int(share * len(values)), len(values) - 1)
     return float(np.partition(values, place)[place])
-
-
-def _calc_site_box(site: Site) -> tuple[Array, Array]:
-    """Return the corners of the box outside of which a rock has left the site [m]."""
-    config = site.config
-    half = 0.5 * config.drift_width + SITE_MARGIN
-    return (
-        np.array([-config.drift_length, -half, -SITE_MARGIN]),
-        np.array([config.void_depth + SITE_MARGIN, half, config.void_height + 20.0]),
-    )

@@ -1,4 +1,4 @@
-"""The machine over a step as the contact solve sees it: inertia, closed loops and rows (see `coupling`).
+"""The machine over a step as the contact solve sees it: inertia, closed loops and rows (see `rocks.drake.plant_view`).
 
 Products of whole matrices are numpy's: a few of them take no time in a step, but seconds each to compile.
 """
@@ -8,16 +8,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from drakerock.rocks.engine.compiling import Array, Record, kernel
+from drakerock.rocks.engine.compiling import Array, Record, Vector, kernel
 from drakerock.rocks.engine.records import (
     JOINT_LAW,
     MACHINE_ROW,
+    NO_BODY,
     SITE_CONTACT,
     as_records,
     count_columns,
 )
 from drakerock.rocks.engine.solve.machine_rows import MachineArrays
 from drakerock.rocks.engine.vectors import cross, get_vector, make_tangents, subtract
+
+__all__ = ["JOINT_WIDTH", "NO_BODY", "SITE_WIDTH", "calc_free_motion", "make_machine_arrays"]
 
 # Numbers of a joint's law and of a contact with the site.
 JOINT_WIDTH = count_columns(JOINT_LAW)
@@ -116,7 +119,7 @@ def _set_site_rows(
     rows: Array,
     values: Array,
 ) -> None:
-    """Set the rows of a contact from `first` on, a normal one and two of friction: Drake's laws, see `coupling`."""
+    """Set the rows of a contact from `first` on, a normal one and two of friction: Drake's laws, see `plant_view`."""
     body, normal = int(contact.body), get_vector(contact.normal)
     arm = subtract(get_vector(contact.point), get_vector(origins[body]))
     tangent_1, tangent_2 = make_tangents(normal)
@@ -133,6 +136,8 @@ def _set_site_rows(
                 + axis[1] * jacobian[body, 4, d]
                 + axis[2] * jacobian[body, 5, d]
             )
+        if contact.other != NO_BODY:
+            _subtract_other(contact, jacobian, origins, axis, rows[first + k])
     depth, stiffness, mu = contact.depth, contact.stiffness, contact.friction
     values[first].target = depth / time_step
     values[first].compliance = 1.0 / (time_step * time_step * stiffness)
@@ -142,3 +147,19 @@ def _set_site_rows(
         values[k].compliance = stiction_tolerance / (mu * time_step * stiffness * depth)
         values[k].lower, values[k].upper = -mu, mu
         values[k].normal_row = first
+
+
+@kernel
+def _subtract_other(contact: Record, jacobian: Array, origins: Array, axis: Vector, row: Array) -> None:
+    """Subtract the other body's velocity at the contact along an axis."""
+    other = int(contact.other)
+    turning = cross(subtract(get_vector(contact.point), get_vector(origins[other])), axis)
+    for d in range(len(row)):
+        row[d] -= (
+            turning[0] * jacobian[other, 0, d]
+            + turning[1] * jacobian[other, 1, d]
+            + turning[2] * jacobian[other, 2, d]
+            + axis[0] * jacobian[other, 3, d]
+            + axis[1] * jacobian[other, 4, d]
+            + axis[2] * jacobian[other, 5, d]
+        )

@@ -83,17 +83,19 @@ JOINT_LAW = np.dtype(
     ]
 )
 
-# A contact of a machine body with the site, see `machine_step`.
+# A contact of the plant's own, of a body with the world or with another body, see `machine_step`.
 SITE_CONTACT = np.dtype(
     [
-        ("body", float),  # number among the bodies that touch rocks
-        ("normal", float, 3),  # unit, in W, out of the site
+        ("body", float),  # number among the bodies of the Jacobian
+        ("normal", float, 3),  # unit, in W, into the body
         ("point", float, 3),  # in W [m]
         ("depth", float),  # [m]
         ("stiffness", float),  # [N/m]
         ("friction", float),  # coefficient
+        ("other", float),  # the other body, NO_BODY: the world
     ]
 )
+NO_BODY = -1
 
 # A contact point between steps, in single precision: all of them are looked at in every step. An even number of
 # numbers, as two take the room of one of a Drake context's.

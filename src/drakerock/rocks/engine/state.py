@@ -101,6 +101,24 @@ class RockArrays:
 
 
 @dataclass(frozen=True, eq=False)
+class ContactTable:
+    """Contact points that carry load (c points).
+
+    Attributes:
+        first, second: (c,) the bodies in the engine's order: rocks, static pieces, half-spaces, pieces of machines.
+        points: (c, 3) in W [m].
+        impulses: (c, 3) on the second over the step, in W [N s].
+        gaps: (c,) at its beginning [m].
+    """
+
+    first: IntArray
+    second: IntArray
+    points: Array
+    impulses: Array
+    gaps: Array
+
+
+@dataclass(frozen=True, eq=False)
 class StepReport:
     """What a step did.
 

@@ -8,15 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drakerock.rocks.config import PileConfig, RocksConfig, SiteConfig
+from drakerock.rocks.config import START_SPEED, PileConfig, RocksConfig, SiteConfig
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
 
-# Rocks leave the emitter as if they had fallen from 0.5 m above it, so that it clears in time [m/s].
-START_SPEED = 3.0
-GRAVITY = 9.81
 # Side of the columns in which the pile's level is looked for: that of a large rock [m].
 COLUMN = 0.8
 # Rocks slower than this lie on the pile, faster ones are falling [m/s].
@@ -85,9 +82,8 @@ def make_rear_emitter(site: SiteConfig, config: PileConfig) -> Emitter:
 
 def _make_emitter(site: SiteConfig, config: PileConfig, x_low: float, x_high: float) -> Emitter:
     half = 0.5 * site.drift_width
-    height, interval = config.emission_height, config.emission_interval
-    thickness = START_SPEED * interval + 0.5 * GRAVITY * interval**2
-    return Emitter(np.array([x_low, -half, height]), np.array([x_high, half, height + thickness]), interval)
+    low, high = [x_low, -half, config.emission_height], [x_high, half, config.emission_top]
+    return Emitter(np.array(low), np.array(high), config.emission_interval)
 
 
 def place_rocks(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +15,16 @@ from platformdirs import user_cache_path
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-import drakerock
-from drakerock.config import Config, calc_config_hash
 from drakerock.errors import InputError, SimulationFailure
+from drakerock.identity import calc_config_hash, get_versions
 from drakerock.randomness import make_generator
 from drakerock.resources import find_data
-from drakerock.rocks.config import PileConfig, RocksConfig, SiteConfig
+from drakerock.rocks.config import PileRecipe
 from drakerock.rocks.contact_graph import find_loose
-from drakerock.rocks.drake.assembly import add_plant, add_site
-from drakerock.rocks.drake.plant_engine import add_plant_rocks, add_rock_bodies
-from drakerock.rocks.engine.config import DynamicsConfig
+from drakerock.rocks.drake.add_rocks import AddRocks
+from drakerock.rocks.drake.drift import AddDrift
+from drakerock.rocks.drake.plant import add_plant
+from drakerock.rocks.drake.plant_engine import AddRockBodies
 from drakerock.rocks.engine.engine import NonsmoothEngine
 from drakerock.rocks.making.emission import (
     Emitter,
@@ -36,13 +37,14 @@ from drakerock.rocks.making.emission import (
 )
 from drakerock.rocks.ordering import order_by_place
 from drakerock.rocks.shapes import RockShape, load_rock_shapes
-from drakerock.rocks.site import Site, make_confined_site, make_site
+from drakerock.rocks.site import Site, make_confined_site, make_site, make_surroundings
 from drakerock.rocks.state import PileState, load_pile, make_empty_pile, save_pile
 from drakerock.rocks.summary import calc_imbalance, calc_support
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and its share done in [0, 1]."""
 
+_LOG = logging.getLogger(__name__)
 
 # The void is full when its level has stayed at the emitter for so many batches: rocks still flow out.
 FULL_BATCHES = 4
@@ -69,16 +71,6 @@ RATTLE_SPEED = 0.1
 BALANCE_ROUNDS = 8
 LOOSE_DISTANCE = 0.01
 FEW_SHARE = 0.002
-
-
-class PileRecipe(Config):
-    """All that a made pile depends on; its hash names the pile in the cache."""
-
-    seed: int
-    site: SiteConfig
-    rocks: RocksConfig
-    pile: PileConfig
-    dynamics: DynamicsConfig
 
 
 def settle(
@@ -158,12 +150,12 @@ def calc_creep(
 def _make_plant_advance(
     pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe, site: Site
 ) -> Callable[[float], PileState]:
-    builder = DiagramBuilder()
-    plant, _ = add_plant(builder, recipe.dynamics)
-    add_site(plant, site, recipe.dynamics)
-    geometries = add_rock_bodies(plant, pile, shapes, recipe.rocks, recipe.dynamics)
+    builder, dynamics = DiagramBuilder(), recipe.dynamics
+    plant, scene_graph = add_plant(builder, dynamics)
+    AddDrift(plant, site, dynamics.plant)
+    bodies = AddRockBodies(plant, pile, recipe.rocks, dynamics.plant, dynamics.reference_overlap, shapes)
     plant.Finalize()
-    rocks = add_plant_rocks(builder, plant, pile, geometries)
+    rocks = AddRocks(builder, plant, scene_graph, pile, recipe.rocks, engine=bodies)
     simulator = Simulator(builder.Build())
     root = simulator.get_mutable_context()
     rocks.set_pile(root, pile)
@@ -179,7 +171,7 @@ def _make_nonsmooth_advance(
     pile: PileState, shapes: tuple[RockShape, ...], recipe: PileRecipe, site: Site
 ) -> Callable[[float], PileState]:
     engine = NonsmoothEngine(
-        recipe.rocks, shapes, site, recipe.dynamics.nonsmooth, recipe.dynamics.time_step,
+        recipe.rocks, shapes, make_surroundings(site), recipe.dynamics.nonsmooth, recipe.dynamics.time_step,
         pile.shape, pile.size, pile.fixed,
     )  # fmt: skip
     arrays = engine.make_arrays(pile)
@@ -236,8 +228,7 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
     provenance = {
         "recipe": calc_config_hash(recipe),
         "seed": recipe.seed,
-        "versions": {"drakerock": drakerock.__version__}
-        | {name: version(name) for name in ("drake", "numba", "numpy")},
+        "versions": get_versions(),
     }
     return replace(pile, provenance=provenance)
 
@@ -332,9 +323,7 @@ def _balance(
     this sets off falls and comes to rest before all are kept awake again; with `until_still` that goes on until no
     rock moves any more while all are awake.
     """
-    nonsmooth = recipe.dynamics.nonsmooth.model_copy(update={"reduction": "none"})
-    dynamics = recipe.dynamics.model_copy(update={"nonsmooth": nonsmooth})
-    awake = recipe.model_copy(update={"dynamics": dynamics})
+    awake = recipe.replace(**{"dynamics.nonsmooth.reduction": "none"})
     surroundings, time_step = site or make_site(recipe.site), recipe.dynamics.time_step
 
     def is_balanced(pile: PileState) -> bool:
@@ -452,20 +441,24 @@ def fetch_pile(recipe: PileRecipe, progress: Progress | None = None) -> tuple[Pi
     pile = load_pile(shipped)
     if pile.provenance.get("recipe") == calc_config_hash(recipe):
         return pile, shipped
-    path = user_cache_path("drakerock") / "piles" / f"{calc_config_hash(recipe, drakerock.__version__)}.npz"
-    if path.exists():
-        try:
+    path = (
+        user_cache_path("drakerock") / "piles" / f"{calc_config_hash(recipe, *get_versions().values())}.npz"
+    )
+    try:
+        if path.exists():
             return load_pile(path), path
-        except InputError:
-            path.unlink(missing_ok=True)  # a damaged cache entry is made anew
+    except (OSError, InputError) as error:
+        _LOG.warning("the pile is made anew: %s", error)
     pile = make_pile(recipe, progress)
+    partial = path.with_suffix(f".{os.getpid()}.partial")  # workers may make the same pile at once
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(f".{os.getpid()}.partial")  # workers may make the same pile at once
         save_pile(pile, partial)
         partial.replace(path)
-    except OSError:
-        pass  # a cache that cannot be written only costs time
+    except (OSError, InputError) as error:
+        _LOG.warning("the pile is not kept for next time: %s", error)
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
     return pile, path
 
 

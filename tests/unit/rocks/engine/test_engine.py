@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.rocks.config import RocksConfig
 from drakerock.rocks.drake.interface import ROCK_SUMMARY
-from drakerock.rocks.drake.system import NonsmoothRocks
 from drakerock.rocks.engine import contact_cache, sleeping
 from drakerock.rocks.engine import engine as engine_module
 from drakerock.rocks.engine.collision import gjk
@@ -46,6 +45,7 @@ from rock_helpers import (
     make_machine_step,
     make_pile,
     make_plane_site,
+    make_rock_diagram,
     make_shape,
     run,
 )
@@ -293,7 +293,7 @@ def test_contacts_of_slow_rocks_follow_their_motion():
 def test_how_often_rocks_that_move_together_are_searched(speed, searches):
     pile = make_pile([[0, 0, 2.0], [0.5005, 0, 2.0]], velocities=[[0, 0, 0, speed, 0, 0]] * 2)
     engine = make_engine(
-        pile, [make_box(0.5, 0.5, 0.5)], config=NonsmoothConfig(reduction="none"), gravity=0.0
+        pile, [make_box(0.5, 0.5, 0.5)], config=NonsmoothConfig(reduction="none"), gravity=np.zeros(3)
     )
     arrays, n_searches = engine.make_arrays(pile), 0
     for _ in range(100):
@@ -428,14 +428,14 @@ def test_changes_written_into_a_copy_are_the_whole_state():
 def test_two_contexts_keep_their_solutions_apart():
     """The solution of a context is not lost when that of its clone is found."""
     pile = draw_pile(3, 20)
-    system = NonsmoothRocks(make_engine(pile, SHAPES, make_plane_site(planes=5)), pile)
-    one = system.CreateDefaultContext()
+    diagram, system = make_rock_diagram(pile, SHAPES, make_plane_site(planes=5))
+    one = diagram.CreateDefaultContext()
     first = system.get_report(one)
     other = one.Clone()
     shifted = replace(pile, p_WRs=pile.p_WRs + [0.0, 0.0, 1.0])
     system.set_pile(other, shifted)
     assert system.get_report(other) != first
-    simulator = Simulator(system, one)
+    simulator = Simulator(diagram, one)
     simulator.AdvanceTo(0.01)
     expected, _ = run(system.engine, system.engine.make_arrays(pile), 0.01)
     assert np.array_equal(system.get_pile(simulator.get_context()).p_WRs, expected.positions)
@@ -531,11 +531,11 @@ def test_a_step_that_does_not_converge_is_redone_then_fails(fails):
     residuals = []
     for iterations, momentum in ((4, config.momentum), (16, 0.0)):
         update = {"iterations": iterations, "momentum": momentum}
-        engine = make_engine(pile, shapes, config=config.model_copy(update=update))
+        engine = make_engine(pile, shapes, config=config.replace(**update))
         residuals.append(engine.advance(engine.make_arrays(pile))[1].residual)
     assert residuals[0] > 2 * residuals[1] > 0
     bound = 0.9 * residuals[1] if fails else 1.1 * residuals[1]
-    engine = make_engine(pile, shapes, config=config.model_copy(update={"max_residual": bound}))
+    engine = make_engine(pile, shapes, config=config.replace(max_residual=bound))
     if fails:
         with pytest.raises(SimulationFailure, match=r"did not converge: residual .* after 16 iterations"):
             engine.advance(engine.make_arrays(pile))
@@ -610,7 +610,7 @@ def push_light_rocks(speed, **settings):
     )
     config = NonsmoothConfig(reduction="none", max_residual=1e9, rounding=1e-6, **settings)
     engine = make_engine(
-        pile, [make_box(1, 1, 1)], config=config, gravity=0.0, pieces=[piece], n_machine_bodies=1
+        pile, [make_box(1, 1, 1)], config=config, gravity=np.zeros(3), pieces=[piece], n_machine_bodies=1
     )
     return engine, engine.step(engine.make_arrays(pile), ram)[1]
 
@@ -644,7 +644,7 @@ def test_acceleration_is_worth_many_iterations():
 
 def test_deep_overlap_recovers_slowly():
     pile = make_pile([[0, 0, 5.0], [0.1, 0.05, 5.2]])
-    engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)], gravity=0.0)
+    engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)], gravity=np.zeros(3))
     arrays = engine.make_arrays(pile)
     fastest = 0.0
     arrays, report = engine.advance(arrays)
@@ -711,20 +711,23 @@ def test_a_site_without_rocks_steps():
 def test_the_system_runs_without_a_machine_and_steps_as_the_engine_does():
     pile = draw_pile(0, 20)
     engine = make_engine(pile, SHAPES, make_plane_site(planes=5))
-    system = NonsmoothRocks(engine, pile)
-    simulator = Simulator(system)
+    diagram, system = make_rock_diagram(pile, SHAPES, make_plane_site(planes=5))
+    simulator = Simulator(diagram)
     simulator.AdvanceTo(0.5)
     expected, _ = run(engine, engine.make_arrays(pile), 0.5)
     actual = system.get_pile(simulator.get_context())
     assert np.array_equal(actual.p_WRs, expected.positions)
-    poses = system.GetOutputPort("rock_poses").Eval(simulator.get_context()).reshape(-1, 7)
-    assert np.array_equal(poses, np.hstack([expected.quaternions, expected.positions]))
-    velocities = system.GetOutputPort("rock_velocities").Eval(simulator.get_context())
-    assert np.array_equal(velocities.reshape(-1, 6), expected.velocities)
-    summary = system.GetOutputPort("rock_summary").Eval(simulator.get_context())
+    context = system.GetMyContextFromRoot(simulator.get_context())
+    shown = system.GetOutputPort("pile").Eval(context)
+    assert np.array_equal(shown.p_WRs, expected.positions)
+    assert np.array_equal(shown.q_WRs, expected.quaternions)
+    assert np.array_equal(shown.V_WRs, expected.velocities)
+    summary = system.GetOutputPort("summary").Eval(context)
     assert summary[list(ROCK_SUMMARY).index("n_awake")] == len(pile)
-    assert not system.GetOutputPort("F_B_W").Eval(simulator.get_context()).any()
-    assert not system.GetOutputPort("rock_status").Eval(simulator.get_context()).any()
+    assert not any(
+        force.get_coeffs().any() for force in system.GetOutputPort("body_spatial_forces").Eval(context)
+    )
+    assert not system.GetOutputPort("status").Eval(context).any()
 
 
 @given(

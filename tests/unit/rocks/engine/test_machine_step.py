@@ -7,6 +7,7 @@ import pytest
 
 from drakerock.rocks.engine.machine_step import (
     JOINT_WIDTH,
+    NO_BODY,
     SITE_WIDTH,
     calc_free_motion,
     make_machine_arrays,
@@ -76,7 +77,7 @@ def test_rows_measure_joints_and_points_on_the_site(rng, inertia, jacobian):
     joints = np.array([[4, 1.0, 0.3, 1e-3, -5.0, 6.0], [7, -1.0, -0.2, 0.0, 0.0, np.inf]])
     normal, point = np.array([0.6, 0.0, 0.8]), np.array([0.3, -1.0, 0.2])
     depth, stiffness, mu, tolerance = 2e-3, 5e6, 0.7, 1e-3
-    contact = np.array([[1, *normal, *point, depth, stiffness, mu]])
+    contact = np.array([[1, *normal, *point, depth, stiffness, mu, NO_BODY]])
     arrays = make_machine_arrays(inverse, jacobian, origins, joints, contact, tolerance, H)
 
     measured = arrays.rows @ velocity
@@ -98,3 +99,15 @@ def test_rows_measure_joints_and_points_on_the_site(rng, inertia, jacobian):
     assert np.allclose(arrays.row_response, arrays.rows @ inverse)
     diagonal = np.diag(arrays.rows @ inverse @ arrays.rows.T)
     assert np.allclose(values["mass"] * (diagonal + values["compliance"]), 1.0)
+
+
+def test_a_contact_of_two_bodies_measures_one_against_the_other(rng, inertia, jacobian):
+    inverse, origins, velocity = np.linalg.inv(inertia), rng.normal(size=(N_BODIES, 3)), rng.normal(size=N_V)
+    normal, point = np.array([0.6, 0.0, 0.8]), np.array([0.3, -1.0, 0.2])
+    contact = np.array([[1, *normal, *point, 2e-3, 5e6, 0.7, 2]])
+    arrays = make_machine_arrays(inverse, jacobian, origins, np.zeros((0, JOINT_WIDTH)), contact, 1e-3, H)
+    V_WBs = [jacobian[b] @ velocity for b in (1, 2)]
+    speeds = [V[3:] + np.cross(V[:3], point - origins[b]) for V, b in zip(V_WBs, (1, 2), strict=True)]
+    measured = arrays.rows @ velocity
+    assert measured[0] == pytest.approx(normal @ (speeds[0] - speeds[1]))
+    assert np.linalg.norm(measured) == pytest.approx(np.linalg.norm(speeds[0] - speeds[1]))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drakerock.rocks.engine.collision import broad_phase, narrow_phase, persistence, poses, speculative
 from drakerock.rocks.engine.collision.broad_phase import Grid
-from drakerock.rocks.engine.collision.narrow_phase import SearchSettings, Surroundings
+from drakerock.rocks.engine.collision.narrow_phase import CollisionGeometry, SearchSettings
 from drakerock.rocks.engine.collision.poses import Boxes, CollisionBodies
 from drakerock.rocks.engine.compiling import Array
 from drakerock.rocks.engine.config import NonsmoothConfig
@@ -49,7 +49,7 @@ class ContactDetection:
     def __init__(
         self,
         bodies: CollisionBodies,
-        surroundings: Surroundings,
+        geometry: CollisionGeometry,
         piece_body: IntArray,
         radius: Array,
         inverse_inertia_local: Array,
@@ -60,7 +60,7 @@ class ContactDetection:
 
         Args:
             bodies: rocks, static pieces, planes, pieces of the machine.
-            surroundings: shapes, planes, and which bodies are what.
+            geometry: shapes, planes, and which bodies are what.
             piece_body: (k,) body of the machine that each piece belongs to.
             radius: (n,) bounding spheres of the rocks [m].
             inverse_inertia_local: (n, 6) in the rocks' frames.
@@ -72,13 +72,13 @@ class ContactDetection:
         self.boxes = Boxes(np.full((n_bodies, 3), np.inf), np.full((n_bodies, 3), -np.inf))
         # What is no rock does not move, or is searched with what does.
         self.modes = np.full(n_bodies, SEARCHED, np.int8)
-        self.modes[n : surroundings.first_piece] = FOLLOWED
+        self.modes[n : geometry.first_piece] = FOLLOWED
         self.extra_speeds = np.zeros(n_bodies)
         self.inverse_inertia = np.zeros((n, 6))
         self.statistics = np.zeros(4, np.int64)
-        self._surroundings = surroundings
+        self._geometry = geometry
         self._piece_body = piece_body
-        self._pieces = np.arange(surroundings.first_piece, surroundings.first_piece + len(piece_body))
+        self._pieces = np.arange(geometry.first_piece, geometry.first_piece + len(piece_body))
         self._inverse_inertia_local = inverse_inertia_local
         self._site_box = site_box
         self._time_step = time_step
@@ -91,8 +91,8 @@ class ContactDetection:
         self._workspace = narrow_phase.make_narrow_workspace()
         self._allocate_pairs(20 * n + 256)
         self.rows = make_contact_rows(6 * n + 256)
-        start, shapes = surroundings.shapes.vertex_start, surroundings.shapes
-        for k in range(n, surroundings.first_plane):
+        start, shapes = geometry.shapes.vertex_start, geometry.shapes
+        for k in range(n, geometry.first_plane):
             vertices = shapes.vertices[start[bodies.shape[k]] : start[bodies.shape[k] + 1]]
             self.boxes.lower[k], self.boxes.upper[k] = vertices.min(axis=0), vertices.max(axis=0)
 
@@ -127,7 +127,7 @@ class ContactDetection:
             margin: of the boxes [m].
         """
         poses.calc_poses(
-            stale, self._surroundings.shapes, quaternions, positions, velocities, self._time_step, margin,
+            stale, self._geometry.shapes, quaternions, positions, velocities, self._time_step, margin,
             self._inverse_inertia_local, self.bodies, self.boxes, self.inverse_inertia,
         )  # fmt: skip
         # Boxes of others are kept from step to step.
@@ -136,7 +136,7 @@ class ContactDetection:
             self.boxes.lower[driven] -= self._time_step * self.extra_speeds[driven, None]
             self.boxes.upper[driven] += self._time_step * self.extra_speeds[driven, None]
         poses.calc_piece_poses(
-            self._surroundings.first_piece, self._piece_body, self._surroundings.shapes, X_WBs, V_WBs,
+            self._geometry.first_piece, self._piece_body, self._geometry.shapes, X_WBs, V_WBs,
             self._time_step, margin, self.bodies, self.boxes,
         )  # fmt: skip
 
@@ -146,7 +146,7 @@ class ContactDetection:
         Returns:
             their number.
         """
-        n, surroundings = len(status), self._surroundings
+        n, geometry = len(status), self._geometry
         self._seeks[:] = (status == AWAKE) & (self.modes[:n] != FOLLOWED)
         seekers = np.flatnonzero(self._seeks)
         low, high = broad_phase.find_region(seekers, self._pieces, self.boxes)
@@ -158,7 +158,7 @@ class ContactDetection:
                 for grid in grids:
                     n_pairs = self._search(chosen, status, grid, n_pairs)
             n_pairs = broad_phase.find_static_pairs(
-                seekers, n, surroundings.first_plane, surroundings.planes, self.boxes, n_pairs, self.pairs
+                seekers, n, geometry.first_plane, geometry.planes, self.boxes, n_pairs, self.pairs
             )
             # The machine's pairs come last.
             for grid in grids:
@@ -204,17 +204,17 @@ class ContactDetection:
         Returns:
             their number.
         """
-        surroundings = self._surroundings
+        geometry = self._geometry
         settings = SearchSettings(
             self._time_step, config.contact_margin, config.manifold_gap, config.face_cosine, config.slow_speed
         )
         workspace = self._workspace._replace(points=self._workspace.points[: config.manifold_points])
         while True:
             n_rows = persistence.follow_contacts(
-                cache, index.active, index.n_active, self.modes, self.bodies, surroundings.restitution[0], self.rows
+                cache, index.active, index.n_active, self.modes, self.bodies, geometry.restitution[0], self.rows
             )  # fmt: skip
             n_rows = narrow_phase.find_contacts(
-                self.pairs, n_pairs, surroundings, self.bodies, velocities, settings, self.modes,
+                self.pairs, n_pairs, geometry, self.bodies, velocities, settings, self.modes,
                 self.extra_speeds, cache, index.table, n_rows, self.rows, self._axis_cache, self._look_up,
                 self.statistics, workspace,
             )  # fmt: skip
@@ -232,7 +232,7 @@ class ContactDetection:
         """
         return int(
             speculative.find_deep_overlaps(
-                n_rows, rows, self._surroundings, self.bodies, velocities, self._time_step, depth,
+                n_rows, rows, self._geometry, self.bodies, velocities, self._time_step, depth,
                 self.extra_speeds, self._workspace.gjk,
             )
         )  # fmt: skip

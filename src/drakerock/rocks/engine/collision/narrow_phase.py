@@ -77,7 +77,7 @@ MATCH_DISTANCE = 0.3
 MIN_SQUARED_OFFSET = 1e-12
 
 
-class Surroundings(NamedTuple):
+class CollisionGeometry(NamedTuple):
     """What does not change from step to step.
 
     Attributes:
@@ -443,15 +443,15 @@ def _write_rows(
     cache: ContactCache,
     first: int,
     n_cached: int,
-    surroundings: Surroundings,
+    geometry: CollisionGeometry,
     bodies: CollisionBodies,
     n_rows: int,
     rows: ContactRows,
 ) -> int:
     """Add a pair's points to the rows, with the impulses that they had in the last step; return the number of rows."""
-    match_limit = MATCH_DISTANCE * core.scale * surroundings.shapes.radius[core.shape]
-    on_machine = bodies.solver_body[b] > surroundings.n_rocks
-    restitution = surroundings.restitution[1] if on_machine else surroundings.restitution[0]
+    match_limit = MATCH_DISTANCE * core.scale * geometry.shapes.radius[core.shape]
+    on_machine = bodies.solver_body[b] > geometry.n_rocks
+    restitution = geometry.restitution[1] if on_machine else geometry.restitution[0]
     used = 0
     for k in range(n_points):
         point, impulse = get_vector(points[k]), (0.0, 0.0, 0.0)
@@ -471,7 +471,7 @@ def _write_rows(
 def find_contacts(
     pairs: Pairs,
     n_pairs: int,
-    surroundings: Surroundings,
+    geometry: CollisionGeometry,
     bodies: CollisionBodies,
     velocities: Array,
     settings: SearchSettings,
@@ -490,7 +490,7 @@ def find_contacts(
 
     Reads:
         pairs, n_pairs: from the broad phase.
-        surroundings: shapes, planes, and which bodies are what.
+        geometry: shapes, planes, and which bodies are what.
         bodies: rocks, static pieces, planes, pieces of the machine, in this order.
         velocities: (bodies of the solve, 6) angular, translational, at the last step.
         settings: how to search.
@@ -508,15 +508,15 @@ def find_contacts(
     Returns:
         number of rows; beyond the capacity they are counted but not stored.
     """
-    shapes = surroundings.shapes
+    shapes = geometry.shapes
     statistics[:] = 0
     _look_up_pairs(pairs, n_pairs, cache, table, axis_cache, look_up)
     for pair in range(n_pairs):
         _prefetch_pair(pairs, look_up, min(pair + AHEAD, n_pairs - 1), bodies, velocities, cache)
         a, b = pairs.a[pair], pairs.b[pair]
         key, first = make_key(a, b), look_up.cached[pair]
-        if first >= 0 and _moves_together(a, b, surroundings, bodies, velocities, settings, modes):
-            n_rows = follow_pair(cache, first, key, bodies, surroundings.restitution[0], n_rows, rows)
+        if first >= 0 and _moves_together(a, b, geometry, bodies, velocities, settings, modes):
+            n_rows = follow_pair(cache, first, key, bodies, geometry.restitution[0], n_rows, rows)
             continue
         n_cached = count_points(key, cache, first)
         core_a = get_core(bodies, a)
@@ -526,8 +526,8 @@ def find_contacts(
         # The direction in which the pair pushed last starts the search; where it did is preferred.
         history, n_known = _read_history(cache, first, n_cached, core_a, workspace.known)
         simplex = 0
-        if surroundings.first_plane <= b < surroundings.first_piece:
-            plane = surroundings.planes[b - surroundings.first_plane]
+        if geometry.first_plane <= b < geometry.first_piece:
+            plane = geometry.planes[b - geometry.first_plane]
             normal, position = negate(get_vector(plane)), get_vector(bodies.positions[a])
             max_gap = settings.margin + settings.time_step * speed
             n_points = _find_plane_points(shapes, core_a, position, plane, max_gap, n_known, workspace)
@@ -543,11 +543,11 @@ def find_contacts(
             if n_cached > 0:
                 simplex = read_simplex(cache.points[first])
             n_points, normal, simplex = _find_core_points(
-                key, shapes, core_a, core_b, p, history, n_known, simplex, way, b >= surroundings.n_rocks, settings,
+                key, shapes, core_a, core_b, p, history, n_known, simplex, way, b >= geometry.n_rocks, settings,
                 axis_cache, statistics, workspace,
             )  # fmt: skip
         n_rows = _write_rows(
-            a, b, core_a, normal, n_points, workspace.points, simplex, cache, first, n_cached, surroundings, bodies,
+            a, b, core_a, normal, n_points, workspace.points, simplex, cache, first, n_cached, geometry, bodies,
             n_rows, rows,
         )  # fmt: skip
     statistics[3] = n_rows
@@ -558,14 +558,14 @@ def find_contacts(
 def _moves_together(
     a: int,
     b: int,
-    surroundings: Surroundings,
+    geometry: CollisionGeometry,
     bodies: CollisionBodies,
     velocities: Array,
     settings: SearchSettings,
     modes: Array,
 ) -> bool:
     """Return whether two rocks that need no search are slow against each other."""
-    if b >= surroundings.n_rocks or modes[a] == SEARCHED or modes[b] == SEARCHED:
+    if b >= geometry.n_rocks or modes[a] == SEARCHED or modes[b] == SEARCHED:
         return False
-    radius = bodies.scale[b] * surroundings.shapes.radius[bodies.shape[b]]
+    radius = bodies.scale[b] * geometry.shapes.radius[bodies.shape[b]]
     return calc_own_speed(bodies, velocities, a, b, radius) < settings.slow_speed

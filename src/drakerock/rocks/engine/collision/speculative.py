@@ -11,7 +11,7 @@ import math
 
 from drakerock.rocks.engine.collision.geometry import Core, calc_support_distance, get_rounding
 from drakerock.rocks.engine.collision.gjk import GjkWorkspace
-from drakerock.rocks.engine.collision.narrow_phase import Surroundings, calc_signed_core_distance
+from drakerock.rocks.engine.collision.narrow_phase import CollisionGeometry, calc_signed_core_distance
 from drakerock.rocks.engine.collision.poses import CollisionBodies
 from drakerock.rocks.engine.collision.shapes import ConvexShapes
 from drakerock.rocks.engine.compiling import Array, Vector, kernel
@@ -56,18 +56,18 @@ def _calc_gap_after(
     a: int,
     b: int,
     normal: Vector,
-    surroundings: Surroundings,
+    geometry: CollisionGeometry,
     bodies: CollisionBodies,
     velocities: Array,
     time_step: float,
     workspace: GjkWorkspace,
 ) -> float:
     """Return the gap of a pair after a step with constant velocities [m]; at least 0 if they do not touch."""
-    shapes = surroundings.shapes
+    shapes = geometry.shapes
     core_a, p_a = _calc_pose_after(bodies, velocities, a, time_step)
     gap = -get_rounding(shapes, core_a)
-    if surroundings.first_plane <= b < surroundings.first_piece:
-        plane = surroundings.planes[b - surroundings.first_plane]
+    if geometry.first_plane <= b < geometry.first_piece:
+        plane = geometry.planes[b - geometry.first_plane]
         up = get_vector(plane)
         gap += dot(up, p_a) - plane[3]
         return gap - calc_support_distance(shapes, core_a, negate(up))
@@ -84,7 +84,7 @@ def _calc_gap_after(
 def find_deep_overlaps(
     n_rows: int,
     rows: ContactRows,
-    surroundings: Surroundings,
+    geometry: CollisionGeometry,
     bodies: CollisionBodies,
     velocities: Array,
     time_step: float,
@@ -96,7 +96,7 @@ def find_deep_overlaps(
 
     Reads:
         n_rows, rows: the step's contacts, solved; rows of a pair are in line.
-        surroundings: shapes, planes, and which bodies are what.
+        geometry: shapes, planes, and which bodies are what.
         bodies: where they are before the step.
         velocities: (bodies of the solve, 6) angular, translational, after it.
         time_step: [s].
@@ -110,7 +110,7 @@ def find_deep_overlaps(
         the number of such pairs.
     """
     n_found = 0
-    shapes = surroundings.shapes
+    shapes = geometry.shapes
     slowest = 0.5 * depth / time_step
     row = 0
     while row < n_rows:
@@ -121,7 +121,7 @@ def find_deep_overlaps(
         v, w = velocities[a], velocities[bodies.solver_body[b]]
         way2 = (w[3] - v[3]) ** 2 + (w[4] - v[4]) ** 2 + (w[5] - v[5]) ** 2
         turning2_a = _calc_squared_turning(shapes, bodies, velocities, a)
-        is_plane = surroundings.first_plane <= b < surroundings.first_piece
+        is_plane = geometry.first_plane <= b < geometry.first_piece
         turning2_b = 0.0 if is_plane else _calc_squared_turning(shapes, bodies, velocities, b)
         # Few are fast enough: the sum of three is at most this.
         if 3.0 * (way2 + turning2_a + turning2_b) < slowest * slowest:
@@ -134,7 +134,7 @@ def find_deep_overlaps(
         if before + time_step * speed < least:
             continue
         normal = get_vector(rows.values[first].normal)
-        gap = _calc_gap_after(a, b, normal, surroundings, bodies, velocities, time_step, workspace)
+        gap = _calc_gap_after(a, b, normal, geometry, bodies, velocities, time_step, workspace)
         if -gap > least:
             extra_speeds[a] = max(extra_speeds[a], speed)
             extra_speeds[b] = max(extra_speeds[b], speed)

@@ -3,11 +3,11 @@
     DIR/study.json              the resolved study, its problem and its versions
     DIR/study.db                points, sequences, cycles, runs, events (SQLite, write-ahead log)
     DIR/points/POINT/attempt_K/loading_NN/...   the files of each cycle, `outcome.json` last
-    DIR/responses.parquet, ...  tables written by `export_tables`
+    DIR/responses.parquet, ...  tables (`tables`)
 
 One process writes the database: the one that holds the lock. A cycle is recorded, with the checksums of its
 files, in one transaction after its folder is complete, so nothing half-written is ever read. What the database
-says is enough for `read_status`; files of unfinished loadings are never counted.
+says is enough for its status (`status`); files of unfinished loadings are never counted.
 """
 
 from __future__ import annotations
@@ -20,35 +20,28 @@ import shutil
 import socket
 import sqlite3
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet
 from pydantic import ValidationError
 
-import drakerock
-from drakerock.config import calc_config_hash
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.problem import Array
-from drakerock.exploration.table import ResponseTable, average_loadings
 from drakerock.files import make_folder, write_text
-from drakerock.loading.cycle import CycleOutcome
+from drakerock.identity import RESULTS_REVISION, calc_config_hash, describe_content, get_versions
+from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario
-from drakerock.study.objectives import get_objective
 from drakerock.study.schema import StudyConfig
 
 DATABASE = "study.db"
 STUDY = "study.json"
 POINTS = "points"
-_SCHEMA_VERSION = 1
+_SCHEMA_VERSION = 2
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS points (
@@ -95,33 +88,19 @@ class Point:
     n_recorded: int
 
 
-@dataclass(frozen=True)
-class Fault:
-    """Something wrong in a store, found by `verify`.
-
-    Attributes:
-        kind: "database", "missing", "damaged", "orphan" or "mismatch".
-        path: relative to the store.
-        message: what is wrong.
-    """
-
-    kind: str
-    path: str
-    message: str
-
-
 class Store:
     """The store of one study. Made by `Store.create` (to write) or `Store.open` (to read).
 
     Attributes:
         folder: where it is.
         study: the resolved study.
+        db: the connection; to be written within `transaction` only.
     """
 
     def __init__(self, folder: Path, study: StudyConfig, db: sqlite3.Connection, lock: Any = None) -> None:
         self.folder = folder
         self.study = study
-        self._db = db
+        self.db = db
         self._lock = lock
 
     @classmethod
@@ -148,12 +127,14 @@ class Store:
                 )
             db = _connect(folder / DATABASE)
             stored = db.execute("SELECT value FROM meta WHERE key = 'identity'").fetchone()
-            if stored and stored[0] != study.calc_identity():
-                raise InputError(_describe_difference(folder, study))
+            wanted = _describe_identity(study)
+            if stored and json.loads(stored[0]) != wanted:
+                raise InputError(_describe_difference(folder, json.loads(stored[0]), wanted))
             _write_study(folder, study)
             store = cls(folder, study, db, lock)
             with store.transaction():
-                db.execute("INSERT OR IGNORE INTO meta VALUES ('identity', ?)", (study.calc_identity(),))
+                db.execute("INSERT OR IGNORE INTO meta VALUES ('identity', ?)", (json.dumps(wanted),))
+                db.execute("INSERT OR IGNORE INTO meta VALUES ('study', ?)", (write_neutral(study),))
                 db.execute("UPDATE runs SET ending = 'killed' WHERE ending = ''")
             return store
         except sqlite3.DatabaseError as error:
@@ -187,7 +168,7 @@ class Store:
 
     def close(self) -> None:
         """Close the database and give up the lock."""
-        self._db.close()
+        self.db.close()
         if self._lock is not None:
             self._lock.close()
 
@@ -199,14 +180,14 @@ class Store:
             RunStopped: the disk is full or cannot be written.
         """
         try:
-            self._db.execute("BEGIN IMMEDIATE")
+            self.db.execute("BEGIN IMMEDIATE")
             try:
-                yield self._db
-                self._db.execute("COMMIT")
+                yield self.db
+                self.db.execute("COMMIT")
             except BaseException:
                 # After a full disk SQLite has rolled back by itself.
-                if self._db.in_transaction:
-                    self._db.execute("ROLLBACK")
+                if self.db.in_transaction:
+                    self.db.execute("ROLLBACK")
                 raise
         except sqlite3.OperationalError as error:
             raise RunStopped(f"{self.folder / DATABASE}: {error}") from None
@@ -224,7 +205,7 @@ class Store:
 
     def list_points(self, role: str | None = None) -> list[Point]:
         """Return all points, or those of a role, in the order in which they were asked for."""
-        rows = self._db.execute(
+        rows = self.db.execute(
             "SELECT p.point, p.role, p.batch, p.x, p.status, COALESCE(s.attempt, -1), COALESCE(s.status, ''), "
             "(SELECT COUNT(*) FROM cycles c WHERE c.point = p.point AND c.attempt = s.attempt) "
             "FROM points p LEFT JOIN sequences s ON s.point = p.point AND s.attempt = "
@@ -248,7 +229,7 @@ class Store:
         versions), and removed otherwise.
         """
         inputs_hash = calc_inputs_hash(scenario, self.study.loadings)
-        row = self._db.execute(
+        row = self.db.execute(
             "SELECT inputs_hash FROM sequences WHERE point = ? AND attempt = ?", (point, attempt)
         ).fetchone()
         fresh = row is None or row[0] != inputs_hash
@@ -317,14 +298,14 @@ class Store:
 
     def clean(self) -> None:
         """Finish the cleaning of sequences that ended just before an earlier run was killed."""
-        for point, attempt in self._db.execute(
+        for point, attempt in self.db.execute(
             "SELECT point, attempt FROM sequences WHERE status != 'running'"
         ).fetchall():
             self._clean_sequence(point, attempt)
 
     def _clean_sequence(self, point: str, attempt: int) -> None:
         folder = self.find_sequence_folder(point, attempt)
-        recorded = self._list_files(point, attempt)
+        recorded = self.list_files(point, attempt)
         if not folder.exists():
             return
         for entry in list(folder.iterdir()):
@@ -335,9 +316,9 @@ class Store:
                     if file.relative_to(folder).as_posix() not in recorded:
                         file.unlink(missing_ok=True)
 
-    def _list_files(self, point: str, attempt: int) -> dict[str, str]:
+    def list_files(self, point: str, attempt: int) -> dict[str, str]:
         """Return the checksums of a sequence's recorded files, by path relative to its folder."""
-        rows = self._db.execute(
+        rows = self.db.execute(
             "SELECT loading, files FROM cycles WHERE point = ? AND attempt = ?", (point, attempt)
         )
         return {
@@ -367,153 +348,6 @@ class Store:
         with self.transaction() as db:
             db.execute("INSERT INTO events VALUES (?, ?, ?)", (time.time(), kind, text))
 
-    # Reading
-
-    def read_responses(self, role: str | None = None) -> ResponseTable:
-        """Return the response table of the points that are done or marked as failed, one row per point.
-
-        Responses are means over the sequence of the attempt that counts; failed cycles are left out, and
-        a point marked as failed has none.
-
-        Raises:
-            InputError: an objective's function failed.
-        """
-        problem = self.study.problem
-        functions = [get_objective(name) for name in self.study.objectives]
-        names: list[str] = []
-        loadings: list[float] = []
-        X: list[Array] = []
-        Y: list[list[float]] = []
-        roles: list[str] = []
-        failures: list[str] = []
-        rows: dict[tuple[str, int], list[tuple[int, str, str, str]]] = {}
-        for point, attempt, *rest in self._db.execute(
-            "SELECT point, attempt, loading, status, reason, outcome FROM cycles ORDER BY loading"
-        ):
-            rows.setdefault((point, attempt), []).append(tuple(rest))
-        reasons = dict(self._db.execute("SELECT point, reason FROM points"))
-        for point in self.list_points(role):
-            if point.status not in ("done", "failed"):
-                continue
-            cycles = rows.get((point.name, point.attempt), [])
-            for loading, status, reason, outcome in cycles or [(0, "failed", "", "")]:
-                lost = point.status == "failed" or status == "failed"
-                names.append(point.name)
-                loadings.append(loading)
-                X.append(point.x)
-                Y.append(
-                    [np.nan] * len(functions)
-                    if lost
-                    else [_evaluate(item.function, item.objective.name, outcome) for item in functions]
-                )
-                roles.append(point.role)
-                failures.append(reasons[point.name] if point.status == "failed" else reason)
-        if not names:
-            d, k = len(problem.variables), len(problem.objectives)
-            return ResponseTable(problem, np.empty((0, d)), np.empty((0, k)))
-        provenance = json.loads((self.folder / STUDY).read_text(encoding="utf-8"))
-        return average_loadings(
-            problem, names, loadings, np.array(X), np.array(Y), roles, failures, provenance=provenance
-        )
-
-    def read_loadings(self) -> pa.Table:
-        """Return one row per recorded cycle, of all attempts: point, variables, objectives, outcome, cost."""
-        problem, columns = self.study.problem, {}
-        functions = [get_objective(name) for name in self.study.objectives]
-        points = {point.name: point for point in self.list_points()}
-        rows = self._db.execute(
-            "SELECT c.point, c.attempt, c.loading, c.status, c.reason, c.outcome, c.seconds, s.inputs_hash "
-            "FROM cycles c JOIN sequences s ON s.point = c.point AND s.attempt = c.attempt "
-            "JOIN points p ON p.point = c.point ORDER BY p.role, c.point, c.attempt, c.loading"
-        ).fetchall()
-        outcomes = [json.loads(row[5]) for row in rows]
-        columns["point"] = [row[0] for row in rows]
-        columns["role"] = [points[row[0]].role for row in rows]
-        for j, name in enumerate(("attempt", "loading", "status", "reason"), start=1):
-            columns[name] = [row[j] for row in rows]
-        for j, name in enumerate(problem.variable_names):
-            columns[name] = [float(points[row[0]].x[j]) for row in rows]
-        for item in functions:
-            columns[item.objective.name] = [
-                None
-                if row[3] == "failed"
-                else _evaluate(item.function, item.objective.name, row[5], missing=None)
-                for row in rows
-            ]
-        for name in ("bucket_mass_kg", "bucket_rocks", "weighed_mass_kg", "loading_time_s", "energy_J",
-                     "peak_push_force_N", "mean_push_force_N", "sim_time_s", "steps", "seed",
-                     "scenario_hash", "wall_time_s"):  # fmt: skip
-            columns[name] = [outcome[name] for outcome in outcomes]
-        for name in ("total", "awake_mean", "awake_max"):
-            columns[f"rocks_{name}"] = [outcome["rocks"].get(name) for outcome in outcomes]
-        columns["seconds"] = [row[6] for row in rows]
-        columns["inputs_hash"] = [row[7] for row in rows]
-        return pa.table(columns)
-
-    def read_status(self) -> dict[str, Any]:
-        """Return the state of the study as plain data, from the database alone."""
-        study, db = self.study, self._db
-        sampling = study.exploration.sampling
-        n_points = sampling.n_samples + sampling.n_validation
-        by_status = dict(db.execute("SELECT status, COUNT(*) FROM points GROUP BY status"))
-        done, marked = by_status.get("done", 0), by_status.get("failed", 0)
-        (n_cycles, n_failed) = db.execute(
-            "SELECT COUNT(*), COALESCE(SUM(status = 'failed'), 0) FROM cycles"
-        ).fetchone()
-        (counted,) = db.execute(
-            "SELECT COUNT(*) FROM cycles c JOIN points p ON p.point = c.point WHERE p.status = 'running' AND "
-            "c.attempt = (SELECT MAX(attempt) FROM sequences s WHERE s.point = c.point)"
-        ).fetchone()
-        recent = db.execute(
-            "SELECT AVG(seconds), AVG(awake) FROM (SELECT seconds, "
-            "json_extract(outcome, '$.rocks.awake_mean') AS awake FROM cycles "
-            "WHERE seconds IS NOT NULL ORDER BY recorded DESC LIMIT 100)"
-        ).fetchone()
-        run = db.execute(
-            "SELECT run, started, ended, host, process, executor, workers, ending FROM runs ORDER BY run DESC"
-        ).fetchone()
-        names = ("number", "started", "ended", "host", "process", "executor", "workers", "ending")
-        live = self.is_running()
-        rest = (n_points - done - marked) * study.loadings - counted
-        seconds, workers = recent[0], run[6] if run else 0
-        running = [
-            {"point": point.name, "attempt": point.attempt, "cycles": point.n_recorded}
-            for point in self.list_points()
-            if live and point.status == "running" and point.attempt_status == "running"
-        ]
-        failures = [
-            {"point": row[0], "attempt": row[1], "loading": row[2], "reason": row[3]}
-            for row in db.execute(
-                "SELECT point, attempt, loading, reason FROM cycles WHERE status = 'failed' UNION ALL "
-                "SELECT point, attempt, NULL, reason FROM sequences WHERE status = 'failed' ORDER BY 1, 2, 3"
-            )
-        ]
-        return {
-            "name": study.name,
-            "running": live,
-            "complete": done + marked >= n_points,
-            "points": {
-                "total": n_points, "done": done, "failed": marked, "running": len(running),
-                "to_do": n_points - done - marked - len(running),
-            },
-            "cycles": {"total": n_points * study.loadings, "recorded": n_cycles, "failed": n_failed},
-            "sequences_running": running,
-            "failures": failures,
-            "points_failed": [
-                {"point": name, "reason": reason}
-                for name, reason in db.execute(
-                    "SELECT point, reason FROM points WHERE status = 'failed' ORDER BY point"
-                )
-            ],
-            "worker_deaths": db.execute("SELECT COUNT(*) FROM events WHERE kind = 'worker lost'").fetchone()[0],
-            "seconds_per_cycle": seconds,
-            "awake_rocks_mean": recent[1],
-            "eta_s": max(rest, 0) * seconds / workers if seconds is not None and workers else None,
-            "last_run": dict(zip(names, run, strict=True)) if run else None,
-            "versions": [json.loads(row[0]) for row in db.execute(
-                "SELECT DISTINCT versions FROM sequences ORDER BY versions")],
-        }  # fmt: skip
-
     def is_running(self) -> bool:
         """Return whether some process, this one included, is running the study."""
         if self._lock is not None:
@@ -526,61 +360,6 @@ class Store:
         except BlockingIOError:
             return True
         return False
-
-    def verify(self) -> list[Fault]:
-        """Check the database, every recorded file's checksum, and that nothing else lies about."""
-        faults = []
-        try:
-            messages = [message for (message,) in self._db.execute("PRAGMA integrity_check")]
-        except sqlite3.DatabaseError as error:
-            messages = [str(error)]
-        if messages != ["ok"]:
-            # What such a database says of the files is worth nothing.
-            return [Fault("database", DATABASE, message) for message in messages]
-        for row in self._db.execute("PRAGMA foreign_key_check"):
-            faults.append(Fault("database", DATABASE, f"table {row[0]} has a row without its {row[2]}"))
-        (identity,) = self._db.execute("SELECT value FROM meta WHERE key = 'identity'").fetchone()
-        if identity != self.study.calc_identity():
-            faults.append(Fault("mismatch", STUDY, "is not the study that the database was made for"))
-        known, open_folders = set(), []
-        for point, attempt, status in self._db.execute(
-            "SELECT point, attempt, status FROM sequences ORDER BY point, attempt"
-        ).fetchall():
-            folder = self.find_sequence_folder(point, attempt)
-            if status == "running":
-                open_folders.append(folder)
-            for name, checksum in self._list_files(point, attempt).items():
-                path = folder / name
-                known.add(path)
-                shown = path.relative_to(self.folder).as_posix()
-                if not path.exists():
-                    faults.append(Fault("missing", shown, "is recorded but not there"))
-                elif _hash_file(path) != checksum:
-                    faults.append(Fault("damaged", shown, "is not as it was recorded (checksum)"))
-        faults += self._verify_outcomes()
-        for path in sorted((self.folder / POINTS).rglob("*")):
-            # Sequences that are not finished may hold files of loadings that are not finished.
-            if path.is_dir() or path in known or path.suffix == ".lock":
-                continue
-            if not any(path.is_relative_to(folder) for folder in open_folders):
-                shown = path.relative_to(self.folder).as_posix()
-                faults.append(Fault("orphan", shown, "belongs to nothing that is recorded"))
-        return faults
-
-    def _verify_outcomes(self) -> list[Fault]:
-        faults = []
-        for point, attempt, loading, text in self._db.execute(
-            "SELECT point, attempt, loading, outcome FROM cycles ORDER BY point, attempt, loading"
-        ):
-            path = self.find_sequence_folder(point, attempt) / f"loading_{loading:02d}" / "outcome.json"
-            try:
-                same = json.loads(path.read_text(encoding="utf-8")) == json.loads(text)
-            except (OSError, ValueError):
-                continue  # missing or damaged, which the checksums say
-            if not same:
-                shown = path.relative_to(self.folder).as_posix()
-                faults.append(Fault("mismatch", shown, "is not what the database holds"))
-        return faults
 
 
 def read_study(folder: str | Path) -> StudyConfig:
@@ -596,35 +375,6 @@ def read_study(folder: str | Path) -> StudyConfig:
         raise InputError(f"{path}: no such file") from None
     except (OSError, ValueError, KeyError, TypeError, ValidationError) as error:
         raise InputError(f"{path}: not a readable study: {str(error).splitlines()[0]}") from None
-
-
-def export_tables(folder: str | Path, formats: Sequence[str] = ("csv", "parquet")) -> list[Path]:
-    """Write `responses` (a row per finished point) and `loadings` (a row per cycle); return the paths.
-
-    Raises:
-        InputError: no store there; not one of the formats csv and parquet; the folder cannot be written.
-    """
-    with Store.open(folder) as store:
-        responses, loadings = store.read_responses(), store.read_loadings()
-    paths = []
-    for suffix in formats:
-        if suffix not in ("csv", "parquet"):
-            raise InputError(f"--format {suffix}: csv or parquet")
-        for name in ("responses", "loadings"):
-            path = Path(folder) / f"{name}.{suffix}"
-            partial = path.with_name(f".partial-{path.name}")
-            try:
-                if name == "responses":
-                    responses.save(partial)
-                elif suffix == "csv":
-                    pyarrow.csv.write_csv(loadings, partial)
-                else:
-                    pyarrow.parquet.write_table(loadings, partial)
-                partial.replace(path)
-            except OSError as error:
-                raise InputError(f"{path}: cannot be written: {error}") from None
-            paths.append(path)
-    return paths
 
 
 def read_outcome(path: Path) -> CycleOutcome:
@@ -644,20 +394,12 @@ def calc_checksums(folder: Path, keep: str) -> dict[str, str]:
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     if keep == "outcomes":
         files = [path for path in files if path.name in _KEPT_OF_OUTCOMES]
-    return {path.relative_to(folder).as_posix(): _hash_file(path) for path in files}
+    return {path.relative_to(folder).as_posix(): hash_file(path) for path in files}
 
 
 def calc_inputs_hash(scenario: Scenario, n_loadings: int) -> str:
     """Return the hash of all that a sequence's outcomes depend on: scenario, seed, loadings, versions."""
-    versions = get_versions()
-    return calc_config_hash(scenario, str(n_loadings), versions["drakerock"], versions["drake"])
-
-
-def get_versions() -> dict[str, str]:
-    """Return the versions that results depend on."""
-    return {"drakerock": drakerock.__version__} | {
-        name: version(name) for name in ("drake", "numba", "numpy")
-    }
+    return calc_config_hash(scenario, str(n_loadings), *get_versions().values())
 
 
 def _connect(path: Path, make: bool = True) -> sqlite3.Connection:
@@ -666,6 +408,11 @@ def _connect(path: Path, make: bool = True) -> sqlite3.Connection:
         (found,) = db.execute("PRAGMA user_version").fetchone()
         if found > _SCHEMA_VERSION:
             raise InputError(f"{path}: made by a newer version (format {found}, not {_SCHEMA_VERSION})")
+        if make and 0 < found < _SCHEMA_VERSION:
+            raise InputError(
+                f"{path}: made by an earlier version (format {found}, not {_SCHEMA_VERSION}), whose results do not "
+                "mix with this one's; take another folder"
+            )
         if found == 0:
             (tables,) = db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
             if tables or not make:
@@ -698,19 +445,22 @@ def _write_study(folder: Path, study: StudyConfig) -> None:
     write_text(folder / STUDY, json.dumps(data, indent=2) + "\n")
 
 
-def _describe_difference(folder: Path, study: StudyConfig) -> str:
-    try:
-        stored = read_study(folder).model_dump(mode="json")
-    except InputError:
-        stored = {}
-    wanted = study.model_dump(mode="json")
-    differs = [
-        key for key in _list_differences(stored, wanted) if not key.startswith(("executor", "storage"))
-    ]
+def _describe_identity(study: StudyConfig) -> dict[str, Any]:
+    """Return all that a study's results depend on: of files their content, and the results revision."""
+    return {"results revision": RESULTS_REVISION} | describe_content(study.make_neutral())
+
+
+def write_neutral(study: StudyConfig) -> str:
+    """Return the same as it stands in the study, with the files' names."""
+    return json.dumps(study.make_neutral().model_dump(mode="json"), sort_keys=True)
+
+
+def _describe_difference(folder: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> str:
+    differs = _list_differences(stored, wanted)
     shown = ", ".join(differs[:5]) + (", ..." if len(differs) > 5 else "")
     return (
-        f"--out {folder}: holds another study (different: {shown or 'unknown'}); take another folder, or the same "
-        "study. The number of points, the executor and the storage may change."
+        f"{folder}: holds another study (different: {shown}); take another folder, or the same study. The number of "
+        "points, the executor and the storage may change; of files the content counts."
     )
 
 
@@ -721,14 +471,7 @@ def _list_differences(one: Any, two: Any, prefix: str = "") -> list[str]:
     return [] if one == two else [prefix.rstrip(".")]
 
 
-def _evaluate(function: Any, name: str, outcome: str, missing: float | None = np.nan) -> Any:
-    try:
-        value = function(CycleOutcome.from_json(outcome))
-        return missing if value is None else float(value)
-    except Exception as error:  # whatever a user's function dies of
-        raise InputError(f"objective '{name}': {type(error).__name__}: {error}") from error
-
-
-def _hash_file(path: Path) -> str:
+def hash_file(path: Path) -> str:
+    """Return the SHA-256 of a file."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

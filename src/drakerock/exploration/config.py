@@ -1,0 +1,90 @@
+"""The exploration's part of the configuration (method section 6)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from drakerock.config import Config
+from drakerock.exploration.problem import Array, Problem
+
+MethodName = Literal["space_filling", "lola_voronoi", "error", "variance", "hypervolume", "front"]
+
+
+class SurrogateConfig(Config):
+    """How the surrogate is fitted."""
+
+    p: float | tuple[float, ...] = Field(default=2.0, description="exponent of the correlation, in (0, 2]")
+    n_starts: int = Field(default=16, ge=1, description="starting points of the maximum likelihood")
+    trend: Literal["mean", "likelihood"] = Field(
+        default="mean",
+        description="constant trend: the mean of the responses, or that of greatest likelihood",
+    )
+    use_noise: bool = Field(default=True, description="use the points' standard errors where they are known")
+
+
+class SamplingConfig(Config):
+    """The campaign's design of experiments."""
+
+    n_initial: int = Field(default=24, ge=0, description="Latin hypercube points of the initial design")
+    n_corners: int = Field(
+        default=16, ge=0, description="corner points of the initial design, at most; all 2^d when they fit"
+    )
+    n_samples: int = Field(default=204, ge=1, description="sample points in all, initial design included")
+    n_validation: int = Field(default=40, ge=0, description="random points used for validation only")
+    batch_size: int = Field(default=8, ge=1, description="points per sequential step")
+    methods: tuple[MethodName, ...] = Field(
+        default=("lola_voronoi", "error"),
+        min_length=1,
+        description="sequential methods, taken in turn per batch",
+    )
+    n_candidates: int = Field(default=2048, ge=64, description="candidate points of the sequential methods")
+    surrogate: SurrogateConfig = SurrogateConfig()
+
+
+class Bound(Config):
+    """A limit on an objective, in its natural sense and unit, such as debris <= 500."""
+
+    objective: str
+    relation: Literal["<=", ">="]
+    value: float
+
+    def __str__(self) -> str:
+        return f"{self.objective}{self.relation}{self.value:g}"
+
+    def calc_violation(self, problem: Problem, Y: Array) -> Array:
+        """Return by how much each row of Y (n, k) breaks the bound, (n,); negative where it holds."""
+        excess = Y[:, problem.get_objective(self.objective)[0]] - self.value
+        return excess if self.relation == "<=" else -excess
+
+
+class ParetoConfig(Config):
+    """Settings of the search for the front."""
+
+    population: int = Field(default=300, ge=4)
+    evaluations: int = Field(default=40_000, ge=100, description="evaluations of the surrogate, about")
+    bounds: tuple[Bound, ...] = Field(default=(), description="limits on objectives")
+    max_trade_off: float | None = Field(
+        default=50.0, gt=1.0, description="M, bound of the trade-off between objectives; null: none"
+    )
+    n_draws: int = Field(default=64, ge=0, description="draws of the surrogate for the front's uncertainty")
+
+
+class SensitivityConfig(Config):
+    """Settings of the Sobol' indices."""
+
+    n_base: int = Field(
+        default=1024, ge=64, description="base samples, a power of two; n_base (d + 2) evaluations"
+    )
+    confidence: float = Field(default=0.95, gt=0.0, lt=1.0, description="probability of the intervals")
+
+
+class ExplorationConfig(Config):
+    """Everything that can be set about the exploration; the study's YAML embeds it."""
+
+    sampling: SamplingConfig = SamplingConfig()
+    surrogate: SurrogateConfig = SurrogateConfig()
+    pareto: ParetoConfig = ParetoConfig()
+    sensitivity: SensitivityConfig = SensitivityConfig()
+    n_confirm: int = Field(default=10, ge=1, description="front points to re-simulate")

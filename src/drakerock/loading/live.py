@@ -1,0 +1,35 @@
+"""A loading in a browser while it is computed: machine, drift and all rocks in Meshcat."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
+from pydrake.systems.framework import DiagramBuilder
+
+from drakerock.loading.parts import StationView
+from drakerock.loading.scenario import Scenario
+from drakerock.loading.station import Station, make_station
+from drakerock.rocks.state import PileState
+
+# Of what is shown [1/s of simulated time]: each frame tells the browser of every rock.
+FRAME_RATE = 10.0
+
+
+def make_live_station(scenario: Scenario, pile: PileState, meshcat: Meshcat) -> Station:
+    """Return a station that shows itself in `meshcat` as it is simulated, seen from behind the machine's side.
+
+    Raises:
+        InputError: as `make_station`.
+    """
+
+    def show(builder: DiagramBuilder, view: StationView) -> None:
+        MeshcatVisualizer.AddToBuilder(
+            builder, view.scene_graph, meshcat, MeshcatVisualizerParams(publish_period=1.0 / FRAME_RATE)
+        )
+
+    toe = float(np.percentile(pile.p_WRs[:, 0], 2)) if len(pile) else 0.0
+    height = scenario.site.drift_height
+    meshcat.SetCameraPose(
+        np.array([toe - 9.0, -0.45 * height, 0.8 * height]), np.array([toe, 0.0, 0.2 * height])
+    )
+    return make_station(scenario, pile, visible=True, extend=show)

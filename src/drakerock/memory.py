@@ -1,0 +1,39 @@
+"""Letting Diagrams go: what Python's garbage collector needs to free them (pydrake 1.58).
+
+A Diagram, its systems and their plant refer to each other, so only the collector frees them. It cannot look into C++:
+a reference that pydrake holds there, back into the Diagram, keeps all of it for good, tens of MB with a full-size pile.
+So a system of ours keeps
+
+- no callback of an abstract port or a cache entry but by `weak` (vector ports and events need no such care);
+- no cache entry, body, frame, joint, output port or geometry id of the plant: their indices, and looks them up.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from typing import Any
+from weakref import WeakMethod
+
+
+def weak[Result](method: Callable[..., Result]) -> Callable[..., Result]:
+    """Return a callable that calls a bound method without keeping the method's object alive."""
+    reference = WeakMethod(method)
+
+    def call(*arguments: Any) -> Result:
+        bound = reference()
+        assert bound is not None, "the system is gone"
+        return bound(*arguments)
+
+    return call
+
+
+def free_diagrams() -> None:
+    """Free the Diagrams that nobody uses any more.
+
+    The collector comes by itself only after so many new Python objects; that a Diagram's memory in C++ is large, it
+    doesn't know.
+    """
+    gc.collect()
+    # The first pass frees wrappers that kept the rest.
+    gc.collect()
