@@ -1,11 +1,11 @@
-"""Contact solvers on the same problems: how far from the solution after how many sweeps?
+"""Contact solvers on the same problems: how far from the solution after how many iterations?
 
     python benchmarks/solvers.py --digs 3
     python benchmarks/solvers.py --size full --digs 1 --every 15
 
 Problems are single steps out of digs, warm started as they were: of 300 rocks, all awake, or of the full-size pile with
-`rest`. The solution is 6000 plain sweeps. Compared are the engine's solve with and without further sweeps about the
-machine, and two ways of accelerating plain sweeps: nonlinear conjugate gradients (Silcowitz-Hansen, Niebe, Erleben
+`rest`. The solution is 6000 plain iterations. Compared are the engine's solve with and without further ones about the
+machine, and two ways of accelerating plain ones: nonlinear conjugate gradients (Silcowitz-Hansen, Niebe, Erleben
 2010) and Anderson's mixing of the last iterates, both measured by impulses times their rows' inverse inertia.
 """
 
@@ -21,113 +21,121 @@ from faithfulness import SIZES, draw_dig, get_start
 from numpy.typing import NDArray
 from rocks import TIME_STEP, clear_way, make_dig, run_dig
 
-from drakerock.rocks.engine import contacts, resting, solver
-from drakerock.rocks.engine.batches import make_batch_arrays
+from drakerock.rocks.engine import engine
 from drakerock.rocks.engine.compiling import allocating_kernel
 from drakerock.rocks.engine.config import NonsmoothConfig
+from drakerock.rocks.engine.records import BODY
+from drakerock.rocks.engine.solve.batches import make_batch_arrays, make_single_bodies
+from drakerock.rocks.engine.solve.gauss_seidel import IterationSettings, solve_contacts
+from drakerock.rocks.engine.solve.machine_rows import (
+    MachineArrays,
+    solve_machine_contacts,
+    solve_machine_rows,
+)
+from drakerock.rocks.engine.solve.rows import (
+    ContactRows,
+    apply_impulses,
+    make_contact_rows,
+    solve_contact,
+)
 
 Array = NDArray[Any]
 Accelerator = Callable[[Array, Array], Array]
 CONVERGED = 6000
 # Below this a rock is slow [m/s].
 SLOW = 0.02
-IMPULSES = slice(contacts.IMPULSE, contacts.IMPULSE + 3)
 
 
 class Problem(NamedTuple):
     """The arguments of a solve, as far as they are data."""
 
-    rows: Array
-    body_a: Array
-    body_b: Array
+    rows: ContactRows
     awake: Array
     bodies: Array
-    n_rocks: int
-    machine: solver.MachineArrays
+    machine: MachineArrays
     velocity: Array
 
     def copy(self) -> Problem:
-        parts = [np.array(part) if isinstance(part, np.ndarray) else part for part in self]
-        parts[6] = solver.MachineArrays(*(part.copy() for part in self.machine))
-        return Problem(*parts)
+        n = len(self.rows.values)
+        rows = make_contact_rows(n)
+        for target, source in zip(rows, self.rows, strict=True):
+            target[:] = source
+        machine = MachineArrays(*(part.copy() for part in self.machine))
+        return Problem(rows, self.awake.copy(), self.bodies.copy(), machine, self.velocity.copy())
 
 
 def find_problems(size: str, n_digs: int, every: int) -> list[Problem]:
     """Return every so many steps' problem of digs, as far as the machine touches rocks."""
     problems: list[Problem] = []
-    usual, count = resting.solve_resting, 0
+    count = 0
 
     def keep(
-        rows: Array, n: int, a: Array, b: Array, awake: Array, bodies: Array, n_rocks: int, *rest: Any
+        n: int, awake: Array, settings: Any, weight: float, rows: ContactRows, bodies: Array, *rest: Any
     ) -> float:
         nonlocal count
         count += 1
-        if count % every == 0 and (b[:n] > n_rocks).sum() > 3:
-            problem = Problem(rows[:n], a[:n], b[:n], awake, bodies, n_rocks, rest[0], rest[1])
-            problems.append(problem.copy())
-        return float(usual(rows, n, a, b, awake, bodies, n_rocks, *rest))
+        if count % every == 0 and (rows.body_b[:n] >= len(bodies)).sum() > 3:
+            first = ContactRows(*(part[:n] for part in rows))
+            problems.append(Problem(first, awake, bodies, rest[0], rest[1]).copy())
+        return float(solve_contacts(n, awake, settings, weight, rows, bodies, *rest))
 
     site, reduction = SIZES[size][1], "rest" if size == "full" else "none"
     for seed in range(n_digs):
         pile = clear_way(get_start(size, seed))
         depth, y = draw_dig(seed, site)
-        resting.solve_resting = keep
+        engine.solve_contacts = keep
         try:
             run_dig(pile, make_dig(depth), NonsmoothConfig(reduction=reduction), 12.0, TIME_STEP, site, y)
         finally:
-            resting.solve_resting = usual
+            engine.solve_contacts = solve_contacts
     return problems
 
 
 @allocating_kernel
-def sweep(
-    rows: Array, n_free: int, order: Array, body_a: Array, body_b: Array, bodies: Array, n_rocks: int,
-    machine: solver.MachineArrays, velocity: Array, forwards: bool,
+def iterate(
+    n_free: int, order: Array, forwards: bool, rows: ContactRows, bodies: Array, machine: MachineArrays,
+    velocity: Array,
 ) -> None:  # fmt: skip
-    """One sweep in double precision; `order` of the machine's contacts."""
-    solver.solve_machine_rows(machine, velocity)
+    """One iteration in double precision; `order` of the machine's contacts."""
+    a, b, scratch, scratch_body = rows.body_a, rows.body_b, np.empty((2, 6)), np.empty(1, BODY)
+    solve_machine_rows(machine, velocity)
     if forwards:
         for k in range(n_free):
-            solver.solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]])
-        solver.solve_machine_contacts(
-            rows, order, body_a, body_b, bodies, n_rocks, machine, velocity, np.empty((3, 6))
-        )
-    else:
-        solver.solve_machine_contacts(
-            rows, order[::-1].copy(), body_a, body_b, bodies, n_rocks, machine, velocity, np.empty((3, 6))
-        )
+            solve_contact(rows.values[k], bodies[a[k]], bodies[b[k]])
+    solve_machine_contacts(order, a, b, machine, rows.values, bodies, velocity, scratch, scratch_body)
+    if not forwards:
         for k in range(n_free - 1, -1, -1):
-            solver.solve_contact(rows[k], bodies[body_a[k]], bodies[body_b[k]])
+            solve_contact(rows.values[k], bodies[a[k]], bodies[b[k]])
 
 
 def gather(problem: Problem) -> Array:
-    """Return all that a sweep changes: impulses of the contacts and the machine's rows, velocities."""
+    """Return all that an iteration changes: impulses of the contacts and the machine's rows, velocities."""
+    bodies = problem.bodies[problem.awake]
     return np.concatenate(
         [
-            problem.rows[:, IMPULSES].reshape(-1),
-            problem.machine.row_values[:, solver.ROW_IMPULSE],
-            problem.bodies[problem.awake, :6].reshape(-1),
+            problem.rows.values["impulse"].reshape(-1),
+            problem.machine.row_values["impulse"],
+            bodies["angular"].reshape(-1),
+            bodies["linear"].reshape(-1),
             problem.velocity,
         ]
     )
 
 
 def scatter(problem: Problem, x: Array) -> None:
-    n, m = len(problem.rows), len(problem.machine.row_values)
-    impulses, row_impulses, velocities, velocity = np.split(x, np.cumsum([3 * n, m, 6 * len(problem.awake)]))
-    problem.rows[:, IMPULSES] = impulses.reshape(-1, 3)
-    problem.machine.row_values[:, solver.ROW_IMPULSE] = row_impulses
-    problem.bodies[problem.awake, :6] = velocities.reshape(-1, 6)
+    n, m, k = len(problem.rows.values), len(problem.machine.row_values), len(problem.awake)
+    impulses, row_impulses, angular, linear, velocity = np.split(x, np.cumsum([3 * n, m, 3 * k, 3 * k]))
+    problem.rows.values["impulse"] = impulses.reshape(-1, 3)
+    problem.machine.row_values["impulse"] = row_impulses
+    problem.bodies["angular"][problem.awake] = angular.reshape(-1, 3)
+    problem.bodies["linear"][problem.awake] = linear.reshape(-1, 3)
     problem.velocity[:] = velocity
 
 
 def make_weights(problem: Problem) -> Array:
     """Return what an iterate's squared change is measured by: impulses by inverse inertia, velocities not at all."""
     masses = np.concatenate(
-        [
-            np.repeat(problem.rows[:, contacts.NORMAL_MASS], 3),
-            problem.machine.row_values[:, solver.ROW_MASS],
-        ]
+        [np.repeat(problem.rows.values["normal_mass"], 3), problem.machine.row_values["mass"]]
     )
     weights = np.zeros(len(gather(problem)))
     weights[: len(masses)] = 1.0 / np.maximum(masses, 1e-30)
@@ -135,7 +143,7 @@ def make_weights(problem: Problem) -> Array:
 
 
 def make_conjugate(problem: Problem) -> Accelerator:
-    """Nonlinear conjugate gradients: a sweep's change counts as the preconditioned gradient."""
+    """Nonlinear conjugate gradients: an iteration's change counts as the preconditioned gradient."""
     weights, last, direction = make_weights(problem), 0.0, np.zeros(0)
 
     def accelerate(before: Array, after: Array) -> Array:
@@ -173,46 +181,45 @@ def make_anderson(problem: Problem, depth: int = 5) -> Accelerator:
     return accelerate
 
 
-def solve(problem: Problem, sweeps: int, make: Callable[[Problem], Accelerator] | None = None) -> Problem:
-    """Solve by plain or accelerated sweeps."""
+def solve(problem: Problem, iterations: int, make: Callable[[Problem], Accelerator] | None = None) -> Problem:
+    """Solve by plain or accelerated iterations."""
     problem = problem.copy()
-    rows, body_a, body_b, _, bodies, n_rocks, machine, velocity = problem
-    solver.apply_impulses(rows, len(rows), body_a, body_b, bodies, n_rocks, machine, velocity)
-    n_free = int((body_b <= n_rocks).sum())
-    order = np.arange(n_free, len(rows))
+    rows, _, bodies, machine, velocity = problem
+    apply_impulses(len(rows.values), rows, machine, bodies, velocity)
+    n_free = int((rows.body_b < len(bodies)).sum())
+    order = np.arange(n_free, len(rows.values))
     accelerate = make(problem) if make else None
-    for k in range(sweeps):
+    for k in range(iterations):
         before = gather(problem) if accelerate else np.zeros(0)
-        sweep(rows, n_free, order, body_a, body_b, bodies, n_rocks, machine, velocity, k % 2 == 0)
-        if accelerate and k < sweeps - 1:
+        forwards = k % 2 == 0
+        iterate(n_free, order if forwards else order[::-1].copy(), forwards, rows, bodies, machine, velocity)
+        if accelerate and k < iterations - 1:
             scatter(problem, accelerate(before, gather(problem)))
     return problem
 
 
 def solve_as_engine(
-    problem: Problem, iterations: int, machine_sweeps: int, momentum: float
+    problem: Problem, iterations: int, machine_iterations: int, acceleration: float
 ) -> tuple[Problem, float]:
     """Solve by the engine's kernel; return the CPU time [s] as well."""
     problem = problem.copy()
-    rows, body_a, body_b, awake, bodies, n_rocks, machine, velocity = problem
+    rows, awake, bodies, machine, velocity = problem
     scratch = (
-        make_batch_arrays(len(rows)),
-        np.zeros(bodies.shape, np.float32),
-        np.zeros(n_rocks + 1 + len(machine.jacobian), np.int64),
+        make_batch_arrays(len(rows.values)),
+        make_single_bodies(len(bodies)),
+        np.zeros(len(bodies) + len(machine.jacobian), np.int64),
     )
+    settings = IterationSettings(iterations, machine_iterations, acceleration)
     start = time.process_time()
-    resting.solve_resting(
-        rows, len(rows), body_a, body_b, awake, bodies, n_rocks, machine, velocity, iterations, machine_sweeps,
-        momentum, *scratch, 0.0,
-    )  # fmt: skip
+    solve_contacts(len(rows.values), awake, settings, 0.0, rows, bodies, machine, velocity, *scratch)
     return problem, time.process_time() - start
 
 
 def calc_push(problem: Problem) -> float:
     """Return the rocks' force on the machine along x [kN]."""
-    rows = problem.rows[problem.body_b > problem.n_rocks]
-    axes = rows[:, contacts.NORMAL : contacts.NORMAL + 9].reshape(-1, 3, 3)
-    return float(np.einsum("kc,kc->", rows[:, IMPULSES], axes[:, :, 0])) / TIME_STEP / 1e3
+    rows = problem.rows.values[problem.rows.body_b >= len(problem.bodies)]
+    axes = np.stack([rows["normal"], rows["tangent_1"], rows["tangent_2"]], axis=1)
+    return float(np.einsum("kc,kc->", rows["impulse"], axes[:, :, 0])) / TIME_STEP / 1e3
 
 
 def main() -> None:
@@ -223,7 +230,7 @@ def main() -> None:
     arguments = parser.parse_args()
     problems = find_problems(arguments.size, arguments.digs, arguments.every)
     exact = [solve(problem, CONVERGED) for problem in problems]
-    mean = np.mean([len(problem.rows) for problem in problems])
+    mean = np.mean([len(problem.rows.values) for problem in problems])
     size = np.mean([abs(calc_push(problem)) for problem in exact])
     print(f"{len(problems)} problems of {mean:.0f} contact points on average; push {size:.0f} kN")
 
@@ -231,10 +238,8 @@ def main() -> None:
         push, speed, slow = [], [], []
         for one, true in zip(solved, exact, strict=True):
             push.append(abs(calc_push(one) - calc_push(true)))
-            mass = 1.0 / one.bodies[one.awake, solver.INVERSE_MASS]
-            found, right = (
-                problem.bodies[problem.awake, solver.LINEAR : solver.LINEAR + 3] for problem in (one, true)
-            )
+            mass = 1.0 / one.bodies["inverse_mass"][one.awake]
+            found, right = (problem.bodies["linear"][problem.awake] for problem in (one, true))
             speeds, true_speeds = np.linalg.norm(found, axis=1), np.linalg.norm(right, axis=1)
             chosen = true_speeds < SLOW
             slow.append(speeds[chosen].sum() / true_speeds[chosen].sum() - 1.0)

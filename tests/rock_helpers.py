@@ -13,7 +13,8 @@ from drakerock.rocks.drake.drift import AddDrift
 from drakerock.rocks.drake.plant import add_plant
 from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
 from drakerock.rocks.engine.engine import MachineStep, NonsmoothEngine, RockArrays, StepReport
-from drakerock.rocks.engine.solver import MACHINE_ROW_WIDTH, MachineArrays
+from drakerock.rocks.engine.records import MACHINE_ROW
+from drakerock.rocks.engine.solve.machine_rows import MachineArrays
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.site import Plane, Site, calc_bounds, make_surroundings
 from drakerock.rocks.state import PileState
@@ -120,7 +121,7 @@ def make_machine_step(X_WBs, velocity, jacobian, response) -> MachineStep:
             jacobian @ response,
             np.zeros((0, v)),
             np.zeros((0, v)),
-            np.zeros((0, MACHINE_ROW_WIDTH)),
+            np.zeros(0, MACHINE_ROW),
         ),
         np.zeros((0, 18)),
     )

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from drakerock.rocks.engine.collision.gjk import make_gjk_workspace
-from drakerock.rocks.engine.collision.nearness import find_near
+from drakerock.rocks.engine.collision.nearness import find_near_pairs
 from drakerock.rocks.engine.collision.shapes import make_convex_shapes
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.state import PileState
@@ -25,7 +25,7 @@ def find_contacts(pile: PileState, shapes: tuple[RockShape, ...], gap: float) ->
     distance = np.linalg.norm(pile.p_WRs[pairs[:, 0]] - pile.p_WRs[pairs[:, 1]], axis=1)
     pairs = pairs[distance <= radii[pairs[:, 0]] + radii[pairs[:, 1]] + gap]
     near = np.zeros(len(pairs), np.bool_)
-    find_near(
+    find_near_pairs(
         # The hulls themselves, without the engine's rounding.
         make_convex_shapes([shape.vertices for shape in shapes], [0.0] * len(shapes)),
         np.ascontiguousarray(pile.shape, np.int64),
@@ -34,8 +34,8 @@ def find_contacts(pile: PileState, shapes: tuple[RockShape, ...], gap: float) ->
         np.ascontiguousarray(pile.p_WRs, float),
         pairs,
         gap,
-        make_gjk_workspace(),
         near,
+        make_gjk_workspace(),
     )
     return pairs[near]
 

@@ -25,7 +25,7 @@ from drakerock.errors import InputError
 from drakerock.memory import weak
 from drakerock.rocks.drake.geometry import PlantGeometry
 from drakerock.rocks.drake.interface import ROCK_SUMMARY, RockContacts, RockSystem, make_empty_contacts
-from drakerock.rocks.engine import contacts, reduction
+from drakerock.rocks.engine.contact_cache import ContactCache, make_contact_cache
 from drakerock.rocks.engine.engine import (
     MachineStep,
     NonsmoothEngine,
@@ -33,6 +33,7 @@ from drakerock.rocks.engine.engine import (
     StepReport,
     make_machineless_step,
 )
+from drakerock.rocks.engine.records import CACHED_POINT, SLEEP
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.state import PileState
 
@@ -55,9 +56,9 @@ class NonsmoothRocks(RockSystem):
     """All rocks of a pile, stepped by the nonsmooth engine.
 
     One solve per step: a cache entry computed from the state at t_n, read by the discrete update and by
-    ``applied_spatial_force`` alike. All state is discrete and numeric, the contact memory and the bookkeeping of the
-    reduction included, so a context can be saved, restored and repeated bit for bit. The engine's scratch memory is
-    shared by all contexts: one thread at a time.
+    ``applied_spatial_force`` alike. All state is discrete and numeric, the contact cache and the bookkeeping of
+    sleeping rocks included, so a context can be saved, restored and repeated bit for bit. The engine's scratch memory
+    is shared by all contexts: one thread at a time.
 
     When a Diagram is initialised, a body of the plant that starts inside the pile is an InputError.
 
@@ -95,8 +96,8 @@ class NonsmoothRocks(RockSystem):
         n = engine.n_rocks
         n_bodies = len(geometry.bodies)
         values = self._flatten(engine.make_arrays(pile))
-        # Room for more points than there are: `counts` tells how many rows of the memory count, and the like.
-        for name, flat in _flatten_memory(contacts.make_memory(engine.capacity)).items():
+        # Room for more points than there are: `counts` tells how many points of the cache count, and the like.
+        for name, flat in _flatten_cache(make_contact_cache(engine.capacity)).items():
             values[name] = np.pad(values[name], (0, len(flat) - len(values[name])))
         values["report"] = np.zeros(len(ROCK_SUMMARY) + 6 * n_bodies)
         self._groups = {name: self.DeclareDiscreteState(flat) for name, flat in values.items()}
@@ -156,23 +157,20 @@ class NonsmoothRocks(RockSystem):
 
     def _get_arrays(self, context: Context) -> RockArrays:
         discrete = context.get_discrete_state()
-        n_points, n_idle, steps = discrete.value(self._groups["counts"]).reshape(-1)
+        n_points, n_sleeping, steps = discrete.value(self._groups["counts"]).reshape(-1)
         arrays = self._view({name: discrete.value(group).reshape(-1) for name, group in self._groups.items()})
-        memory = arrays.memory.select(slice(int(n_points)))
-        return replace(arrays, memory=memory, n_idle=int(n_idle), steps=int(steps))
+        cache = arrays.cache.select(slice(int(n_points)))
+        return replace(arrays, cache=cache, n_sleeping=int(n_sleeping), steps=int(steps))
 
     def _view(self, state: dict[str, Array]) -> RockArrays:
-        """Return arrays that are in the state's, memory with its full capacity, without the counts."""
+        """Return arrays that are in the state's, the cache with its full capacity, without the counts."""
         n = self._engine.n_rocks
         return RockArrays(
             state["quaternions"].reshape(n, 4),
             state["positions"].reshape(n, 3),
             state["velocities"].reshape(n, 6),
-            state["book"].reshape(n, reduction.BOOK_WIDTH),
-            contacts.Memory(
-                state["pairs"].view(np.int32).reshape(-1, 2),
-                state["memory"].view(np.float32).reshape(-1, contacts.MEMORY_WIDTH),
-            ),
+            state["sleep"].view(SLEEP),
+            ContactCache(state["pairs"].view(np.int32).reshape(-1, 2), state["points"].view(CACHED_POINT)),
         )
 
     def _flatten(self, arrays: RockArrays) -> dict[str, Array]:
@@ -180,8 +178,8 @@ class NonsmoothRocks(RockSystem):
             "quaternions": arrays.quaternions.reshape(-1),
             "positions": arrays.positions.reshape(-1),
             "velocities": arrays.velocities.reshape(-1),
-            "book": arrays.book.reshape(-1),
-            **_flatten_memory(arrays.memory),
+            "sleep": arrays.sleep.view(float),
+            **_flatten_cache(arrays.cache),
             "counts": _count(arrays),
         }
 
@@ -271,7 +269,7 @@ class NonsmoothRocks(RockSystem):
         return np.array(context.get_discrete_state(self._groups["report"]).value())
 
     def _calc_status(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._get_arrays(context).book[:, reduction.STATUS])
+        output.SetFromVector(self._get_arrays(context).status)
 
     def _calc_contacts(self, context: Context, output: Value) -> None:
         output.set_value(self._find_contacts(context))
@@ -296,12 +294,9 @@ _N_FLAGGED = list(ROCK_SUMMARY).index("n_flagged")
 
 
 def _count(arrays: RockArrays) -> Array:
-    return np.array([len(arrays.memory.pairs), arrays.n_idle, arrays.steps], float)
+    return np.array([len(arrays.cache.pairs), arrays.n_sleeping, arrays.steps], float)
 
 
-def _flatten_memory(memory: contacts.Memory) -> dict[str, Array]:
+def _flatten_cache(cache: ContactCache) -> dict[str, Array]:
     # Bits, two numbers in one.
-    return {
-        "pairs": memory.pairs.reshape(-1).view(np.float64),
-        "memory": memory.values.reshape(-1).view(np.float64),
-    }
+    return {"pairs": cache.pairs.reshape(-1).view(np.float64), "points": cache.points.view(np.float64)}

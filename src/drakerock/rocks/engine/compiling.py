@@ -21,10 +21,14 @@ from numba import types
 from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import NDArray
 
-# Types of the kernels' arguments: arrays of any number type, a rotation by rows, a vector in three numbers.
+# Types of the kernels' arguments: arrays of any number type, a record (see `records`), a vector in three numbers, a
+# quaternion w x y z, a symmetric matrix xx xy xz yy yz zz, a rotation by rows.
 Array = NDArray[Any]
-Rotation = tuple[float, float, float, float, float, float, float, float, float]
+Record = Any
 Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Symmetric = tuple[float, float, float, float, float, float] | NDArray[Any]
+Rotation = tuple[float, float, float, float, float, float, float, float, float]
 
 _log = logging.getLogger(__name__)
 

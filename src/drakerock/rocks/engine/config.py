@@ -2,74 +2,91 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from drakerock.config import Config
 
 
-class RestConfig(Config):
-    """When rocks come to rest and when they are woken (reduction: rest).
+def _advanced(**settings: Any) -> Any:
+    """Return a field for those who know the method; users judge a simulation by the others."""
+    return Field(json_schema_extra={"advanced": True}, **settings)
 
-    A resting rock is not solved and pairs of resting rocks are not searched; their contact impulses are kept.
+
+class RestConfig(Config):
+    """When rocks fall asleep and when they are woken (reduction: rest).
+
+    A sleeping rock is not solved and pairs of sleeping rocks are not searched; their contact impulses are kept.
     """
 
     displacement: Annotated[
-        float, Field(gt=0, description="a rock rests when it moved less than this [m] ...")
+        float, _advanced(gt=0, description="a rock falls asleep when it moved less than this [m] ...")
     ] = 0.0002
-    time: Annotated[float, Field(gt=0, description="... within this time [s]")] = 0.1
-    speed: Annotated[float, Field(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
+    time: Annotated[float, _advanced(gt=0, description="... within this time [s]")] = 0.1
+    speed: Annotated[float, _advanced(gt=0, description="... and is slower than this [m/s, rad/s]")] = 0.05
     mover_speed: Annotated[
-        float, Field(gt=0, description="... and leans on none that is faster than this, a mover [m/s]")
+        float, _advanced(gt=0, description="... and leans on none that is faster than this, a mover [m/s]")
     ] = 0.001
     wake_load: Annotated[
         float,
-        Field(
+        _advanced(
             gt=0,
             description="it wakes when the sum of its contact impulses has changed by this multiple of its weight's",
         ),
     ] = 0.3
     wake_share: Annotated[
-        float, Field(ge=0, description="... and of half the sum of their sizes, the pressure on it")
+        float, _advanced(ge=0, description="... and of half the sum of their sizes, the pressure on it")
     ] = 0.3
     wake_near_movers: Annotated[
-        float, Field(ge=0, le=1, description="... both times this, if it leans on a mover")
+        float, _advanced(ge=0, le=1, description="... both times this, if it leans on a mover")
     ] = 0.1
-    wake_steps: Annotated[int, Field(ge=1, description="... for this many steps on end")] = 1
+    wake_steps: Annotated[int, _advanced(ge=1, description="... for this many steps on end")] = 1
     recheck_period: Annotated[
         float,
-        Field(gt=0, description="this often all that have moved since the start are woken together [s]"),
+        _advanced(gt=0, description="this often all that have moved since the start are woken together [s]"),
     ] = 2.0
     sensor_length: Annotated[
-        float, Field(ge=0, le=10, description="rocks this far in front of the bucket are awake [m]")
+        float, _advanced(ge=0, le=10, description="rocks this far in front of the bucket are awake [m]")
     ] = 2.0
     sensor_margin: Annotated[
-        float, Field(ge=0, le=5, description="... and this far from it to the other sides [m]")
+        float, _advanced(ge=0, le=5, description="... and this far from it to the other sides [m]")
     ] = 0.3
 
 
 class NonsmoothConfig(Config):
-    """The nonsmooth engine: stepper, contact solve, collision margins, reduction."""
+    """The nonsmooth engine: stepper, contact solve, collision margins, sleeping rocks.
 
-    iterations: Annotated[int, Field(ge=1, le=2000, description="sweeps of the resting stage")] = 50
+    Six settings are a user's: `iterations`, `stiffness_factor`, `linear_overlap`, `rounding`, `reduction`,
+    `max_penetration`. The others are advanced: parameters of the method, marked as such in the JSON schema.
+    """
+
+    iterations: Annotated[
+        int, Field(ge=1, le=2000, description="Gauss-Seidel iterations over all contacts in each step")
+    ] = 50
     machine_sweeps: Annotated[
-        int, Field(ge=0, le=100, description="further sweeps per sweep over the contacts around the machine")
+        int,
+        _advanced(
+            ge=0, le=100, description="further iterations after each over the contacts around the machine"
+        ),
     ] = 1
     momentum: Annotated[
         float,
-        Field(
+        _advanced(
             ge=0,
             lt=1,
-            description="greatest share of two sweeps' change by which they are continued; 0: none",
+            description="Nesterov acceleration: greatest share of two iterations' change by which they are "
+            "extrapolated; 0: none",
         ),
     ] = 0.8
-    impact_iterations: Annotated[int, Field(ge=1, le=500, description="sweeps of the impact stage")] = 10
+    impact_iterations: Annotated[
+        int, _advanced(ge=1, le=500, description="Gauss-Seidel iterations of the impact stage")
+    ] = 10
     impact_threshold: Annotated[
-        float, Field(gt=0, description="contacts that approach faster are impacts [m/s]")
+        float, _advanced(gt=0, description="contacts that approach faster are impacts [m/s]")
     ] = 0.1
     damping_time: Annotated[
-        float, Field(ge=0, description="SPOOK's tau, time in which overlaps decay [time steps]")
+        float, _advanced(ge=0, description="SPOOK's tau, time in which overlaps decay [time steps]")
     ] = 4.5
     stiffness_factor: Annotated[
         float,
@@ -87,20 +104,20 @@ class NonsmoothConfig(Config):
         ),
     ] = 0.0
     spin_damping: Annotated[
-        float, Field(ge=0, le=20, description="each loaded contact damps the pair's relative spin [1/s]")
+        float, _advanced(ge=0, le=20, description="each loaded contact damps the pair's relative spin [1/s]")
     ] = 2.0
     max_recovery_speed: Annotated[
-        float, Field(gt=0, description="overlaps without load are pushed apart at most this fast [m/s]")
+        float, _advanced(gt=0, description="overlaps without load are pushed apart at most this fast [m/s]")
     ] = 1.0
     rounding: Annotated[
         float, Field(gt=0, le=0.1, description="rounding of the rocks' edges [sieve width]")
     ] = 0.03
     contact_margin: Annotated[
-        float, Field(gt=0, le=0.2, description="contacts are found this far ahead of touching [m]")
+        float, _advanced(gt=0, le=0.2, description="contacts are found this far ahead of touching [m]")
     ] = 0.005
     search_distance: Annotated[
         float,
-        Field(
+        _advanced(
             ge=0,
             le=0.01,
             description="contacts of slow rocks are searched after this way, their turning included, and follow their "
@@ -109,7 +126,7 @@ class NonsmoothConfig(Config):
     ] = 0.001
     search_period: Annotated[
         int,
-        Field(
+        _advanced(
             ge=1,
             le=20,
             description="contacts of faster rocks that move together are searched every so many steps (1: all contacts "
@@ -117,23 +134,25 @@ class NonsmoothConfig(Config):
         ),
     ] = 6
     slow_speed: Annotated[
-        float, Field(ge=0, le=0.1, description="rocks are slow below this, their turning included [m/s]")
+        float, _advanced(ge=0, le=0.1, description="rocks are slow below this, their turning included [m/s]")
     ] = 0.02
     manifold_gap: Annotated[
-        float, Field(ge=0, le=0.2, description="corners of faces that touch count up to this gap [m]")
+        float, _advanced(ge=0, le=0.2, description="corners of faces that touch count up to this gap [m]")
     ] = 0.003
     face_cosine: Annotated[
-        float, Field(gt=0, le=1, description="faces touch if this well aligned with the contact's normal")
+        float, _advanced(gt=0, le=1, description="faces touch if this well aligned with the contact's normal")
     ] = 0.985
     manifold_points: Annotated[
         int,
-        Field(ge=1, le=4, description="points per pair; with 1, as in point contact, faces roll on faces"),
+        _advanced(
+            ge=1, le=4, description="points per pair; with 1, as in point contact, faces roll on faces"
+        ),
     ] = 4
     reduction: Literal["none", "rest"] = "rest"
     rest: RestConfig = RestConfig()
     max_residual: Annotated[
         float,
-        Field(
+        _advanced(
             gt=0,
             description="a step with more is flagged and solved again with more iterations, then fails",
         ),
@@ -146,7 +165,8 @@ class NonsmoothConfig(Config):
         ),
     ] = 0.04
     memory_per_rock: Annotated[
-        int, Field(ge=3, le=50, description="loaded contact points that can be kept, per rock")
+        int,
+        _advanced(ge=3, le=50, description="loaded contact points that the contact cache can keep, per rock"),
     ] = 4
 
     @model_validator(mode="after")

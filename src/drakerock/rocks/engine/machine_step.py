@@ -8,39 +8,23 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from drakerock.rocks.engine.collision.geometry import make_tangents
-from drakerock.rocks.engine.compiling import Array, kernel
-from drakerock.rocks.engine.solver import (
-    LOWER,
-    MACHINE_ROW_WIDTH,
-    NORMAL_ROW,
-    ROW_COMPLIANCE,
-    ROW_MASS,
-    TARGET,
-    UPPER,
-    MachineArrays,
+from drakerock.rocks.engine.compiling import Array, Record, Vector, kernel
+from drakerock.rocks.engine.records import (
+    JOINT_LAW,
+    MACHINE_ROW,
+    NO_BODY,
+    SITE_CONTACT,
+    as_records,
+    count_columns,
 )
+from drakerock.rocks.engine.solve.machine_rows import MachineArrays
+from drakerock.rocks.engine.vectors import cross, get_vector, make_tangents, subtract
 
-# Columns of a joint's law.
-JOINT_VELOCITY = 0  # its place among the generalised velocities
-JOINT_SIDE = 1  # 1, or -1: the row measures the velocity reversed
-JOINT_TARGET = 2  # and so on as in `solver`: target, compliance, lower, upper
-JOINT_COMPLIANCE = 3
-JOINT_LOWER = 4
-JOINT_UPPER = 5
-JOINT_WIDTH = 6
+__all__ = ["JOINT_WIDTH", "NO_BODY", "SITE_WIDTH", "calc_free_motion", "make_machine_arrays"]
 
-# Columns of a contact of the plant's own, of a body with the world or with another body.
-SITE_BODY = 0
-SITE_NORMAL = 1  # 1..3 unit normal in W, into the body
-SITE_POINT = 4  # 4..6 in W
-SITE_DEPTH = 7
-SITE_STIFFNESS = 8
-SITE_FRICTION = 9
-SITE_OTHER = 10  # the other body, NO_BODY: the world
-SITE_WIDTH = 11
-
-NO_BODY = -1
+# Numbers of a joint's law and of a contact with the site.
+JOINT_WIDTH = count_columns(JOINT_LAW)
+SITE_WIDTH = count_columns(SITE_CONTACT)
 
 # Of the linkage's closed loops, as a share of the mobility they take away.
 LOOP_COMPLIANCE = 1e-10
@@ -84,17 +68,20 @@ def make_machine_arrays(
         inverse: (v, v) inverse inertia.
         jacobian: (b, 6, v) of the bodies that touch rocks, at their origins in W.
         origins: (b, 3) these [m].
-        joints: (j, JOINT_WIDTH) laws of motors and stops.
-        contacts: (c, SITE_WIDTH).
+        joints: (j, JOINT_WIDTH) laws of motors and stops, columns as of `JOINT_LAW`.
+        contacts: (c, SITE_WIDTH) columns as of `SITE_CONTACT`.
         stiction_tolerance: slip at which friction is full [m/s].
         time_step: [s].
     """
     n_rows = len(joints) + 3 * len(contacts)
-    rows, values = np.zeros((n_rows, len(inverse))), np.zeros((n_rows, MACHINE_ROW_WIDTH))
-    values[:, NORMAL_ROW] = -1.0
-    _set_rows(joints, contacts, jacobian, origins, stiction_tolerance, time_step, rows, values)
+    rows, values = np.zeros((n_rows, len(inverse))), np.zeros(n_rows, MACHINE_ROW)
+    values["normal_row"] = -1.0
+    _set_rows(
+        as_records(joints, JOINT_LAW), as_records(contacts, SITE_CONTACT), jacobian, origins, stiction_tolerance,
+        time_step, rows, values,
+    )  # fmt: skip
     row_response = rows @ inverse
-    values[:, ROW_MASS] = 1.0 / (np.einsum("rv,rv->r", rows, row_response) + values[:, ROW_COMPLIANCE])
+    values["mass"] = 1.0 / (np.einsum("rv,rv->r", rows, row_response) + values["compliance"])
     response = inverse @ jacobian.transpose(0, 2, 1)
     return MachineArrays(jacobian, response, jacobian @ response, rows, row_response, values)
 
@@ -111,20 +98,19 @@ def _set_rows(
     values: Array,
 ) -> None:
     """Set all rows but for what follows from inertia."""
-    n_joints = len(joints)
-    for k in range(n_joints):
-        rows[k, int(joints[k, JOINT_VELOCITY])] = joints[k, JOINT_SIDE]
-        values[k, TARGET], values[k, ROW_COMPLIANCE] = joints[k, JOINT_TARGET], joints[k, JOINT_COMPLIANCE]
-        values[k, LOWER], values[k, UPPER] = joints[k, JOINT_LOWER], joints[k, JOINT_UPPER]
+    for k in range(len(joints)):
+        joint, row = joints[k], values[k]
+        rows[k, int(joint.velocity)] = joint.side
+        row.target, row.compliance = joint.target, joint.compliance
+        row.lower, row.upper = joint.lower, joint.upper
     for c in range(len(contacts)):
-        _set_site_rows(
-            contacts[c], jacobian, origins, n_joints + 3 * c, stiction_tolerance, time_step, rows, values
-        )
+        first = len(joints) + 3 * c
+        _set_site_rows(contacts[c], jacobian, origins, first, stiction_tolerance, time_step, rows, values)
 
 
 @kernel
 def _set_site_rows(
-    contact: Array,
+    contact: Record,
     jacobian: Array,
     origins: Array,
     first: int,
@@ -134,55 +120,46 @@ def _set_site_rows(
     values: Array,
 ) -> None:
     """Set the rows of a contact from `first` on, a normal one and two of friction: Drake's laws, see `plant_view`."""
-    body = int(contact[SITE_BODY])
-    nx, ny, nz = contact[SITE_NORMAL], contact[SITE_NORMAL + 1], contact[SITE_NORMAL + 2]
-    tx, ty, tz, ux, uy, uz = make_tangents(nx, ny, nz)
-    x = contact[SITE_POINT] - origins[body, 0]
-    y = contact[SITE_POINT + 1] - origins[body, 1]
-    z = contact[SITE_POINT + 2] - origins[body, 2]
-    axes = ((nx, ny, nz), (tx, ty, tz), (ux, uy, uz))
+    body, normal = int(contact.body), get_vector(contact.normal)
+    arm = subtract(get_vector(contact.point), get_vector(origins[body]))
+    tangent_1, tangent_2 = make_tangents(normal)
+    axes = (normal, tangent_1, tangent_2)
     for k in range(3):
-        ax, ay, az = axes[k]
         # The velocity along an axis, of a point at an arm from the body's origin.
-        turning = (y * az - z * ay, z * ax - x * az, x * ay - y * ax)
+        axis, turning = axes[k], cross(arm, axes[k])
         for d in range(rows.shape[1]):
             rows[first + k, d] = (
                 turning[0] * jacobian[body, 0, d]
                 + turning[1] * jacobian[body, 1, d]
                 + turning[2] * jacobian[body, 2, d]
-                + ax * jacobian[body, 3, d]
-                + ay * jacobian[body, 4, d]
-                + az * jacobian[body, 5, d]
+                + axis[0] * jacobian[body, 3, d]
+                + axis[1] * jacobian[body, 4, d]
+                + axis[2] * jacobian[body, 5, d]
             )
-        if contact[SITE_OTHER] != NO_BODY:
-            _subtract_other(contact, jacobian, origins, ax, ay, az, rows[first + k])
-    depth, stiffness, mu = contact[SITE_DEPTH], contact[SITE_STIFFNESS], contact[SITE_FRICTION]
-    values[first, TARGET] = depth / time_step
-    values[first, ROW_COMPLIANCE] = 1.0 / (time_step * time_step * stiffness)
-    values[first, UPPER] = np.inf
+        if contact.other != NO_BODY:
+            _subtract_other(contact, jacobian, origins, axis, rows[first + k])
+    depth, stiffness, mu = contact.depth, contact.stiffness, contact.friction
+    values[first].target = depth / time_step
+    values[first].compliance = 1.0 / (time_step * time_step * stiffness)
+    values[first].upper = np.inf
     for k in range(first + 1, first + 3):
         # Drake's regularised friction is full at the stiction tolerance.
-        values[k, ROW_COMPLIANCE] = stiction_tolerance / (mu * time_step * stiffness * depth)
-        values[k, LOWER], values[k, UPPER] = -mu, mu
-        values[k, NORMAL_ROW] = first
+        values[k].compliance = stiction_tolerance / (mu * time_step * stiffness * depth)
+        values[k].lower, values[k].upper = -mu, mu
+        values[k].normal_row = first
 
 
 @kernel
-def _subtract_other(
-    contact: Array, jacobian: Array, origins: Array, ax: float, ay: float, az: float, row: Array
-) -> None:
+def _subtract_other(contact: Record, jacobian: Array, origins: Array, axis: Vector, row: Array) -> None:
     """Subtract the other body's velocity at the contact along an axis."""
-    other = int(contact[SITE_OTHER])
-    x = contact[SITE_POINT] - origins[other, 0]
-    y = contact[SITE_POINT + 1] - origins[other, 1]
-    z = contact[SITE_POINT + 2] - origins[other, 2]
-    turning = (y * az - z * ay, z * ax - x * az, x * ay - y * ax)
+    other = int(contact.other)
+    turning = cross(subtract(get_vector(contact.point), get_vector(origins[other])), axis)
     for d in range(len(row)):
         row[d] -= (
             turning[0] * jacobian[other, 0, d]
             + turning[1] * jacobian[other, 1, d]
             + turning[2] * jacobian[other, 2, d]
-            + ax * jacobian[other, 3, d]
-            + ay * jacobian[other, 4, d]
-            + az * jacobian[other, 5, d]
+            + axis[0] * jacobian[other, 3, d]
+            + axis[1] * jacobian[other, 4, d]
+            + axis[2] * jacobian[other, 5, d]
         )

@@ -8,49 +8,55 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from drakerock.rocks.engine import batches, contacts, solver
+from drakerock.rocks.engine.contact_law import ContactLaw
 from drakerock.rocks.engine.engine import make_machineless_step
+from drakerock.rocks.engine.records import BODY
+from drakerock.rocks.engine.solve import batches
+from drakerock.rocks.engine.solve.bodies import copy_body
+from drakerock.rocks.engine.solve.rows import make_contact_rows, prepare_rows, solve_contact
+
+LAW = ContactLaw(
+    hertz=7e8, linear=False, time_step=0.01, damping=0.05, max_recovery_speed=1.0, impact_threshold=10.0
+)
 
 
 def draw_rows(rng, n_rows, n_rocks):
     """Contact rows between random pairs of rocks, a fifth of them with the ground, prepared for the solve."""
-    body_a = rng.integers(0, n_rocks, n_rows)
-    body_b = np.where(
-        rng.random(n_rows) < 0.2, n_rocks, (body_a + rng.integers(1, n_rocks, n_rows)) % n_rocks
+    rows = make_contact_rows(n_rows)
+    rows.body_a[:] = rng.integers(0, n_rocks, n_rows)
+    rows.body_b[:] = np.where(
+        rng.random(n_rows) < 0.2, n_rocks, (rows.body_a + rng.integers(1, n_rocks, n_rows)) % n_rocks
     )
-    rows = np.zeros((n_rows, contacts.ROW_WIDTH))
-    for row in rows:
+    for row in rows.values:
         frame = Rotation.random(random_state=rng).as_matrix()
-        row[contacts.NORMAL : contacts.NORMAL + 9] = frame.reshape(-1)
-        row[contacts.ARM_A : contacts.ARM_A + 6] = rng.normal(0, 0.3, 6)
-        row[contacts.FRICTION] = 0.8
-        row[contacts.GAP] = rng.uniform(-2e-3, 1e-3)
-        row[contacts.IMPULSE : contacts.IMPULSE + 3] = rng.uniform(0, 5.0), 0.5, -0.5
-    bodies = np.zeros((n_rocks + 1, solver.BODY_WIDTH))
-    bodies[:n_rocks, :6] = rng.normal(0, 0.2, (n_rocks, 6))
-    bodies[:n_rocks, solver.INVERSE_MASS] = 0.01
-    bodies[:n_rocks, solver.INVERSE_INERTIA : solver.INVERSE_INERTIA + 6] = [0.2, 0.02, 0.01, 0.3, 0.02, 0.25]
-    machine = make_machineless_step().arrays
-    softness = np.append(np.full(n_rocks, 2.0), 0.0)
-    solver.prepare_rows(
-        rows, n_rows, body_a, body_b, bodies, n_rocks, machine, np.zeros(0), softness, 7e8, False, 0.01, 0.05, 1.0, 10.0
-    )  # fmt: skip
-    return rows, body_a, body_b, bodies
+        row["normal"], row["tangent_1"], row["tangent_2"] = frame
+        row["arm_a"], row["arm_b"] = rng.normal(0, 0.3, (2, 3))
+        row["friction"] = 0.8
+        row["gap"] = rng.uniform(-2e-3, 1e-3)
+        row["impulse"] = rng.uniform(0, 5.0), 0.5, -0.5
+    bodies = np.zeros(n_rocks + 1, BODY)
+    rocks = bodies[:n_rocks]
+    rocks["angular"], rocks["linear"] = rng.normal(0, 0.2, (2, n_rocks, 3))
+    rocks["inverse_mass"] = 0.01
+    rocks["inverse_inertia"] = [0.2, 0.02, 0.01, 0.3, 0.02, 0.25]
+    compliance = np.append(np.full(n_rocks, 2.0), 0.0)
+    prepare_rows(n_rows, bodies, compliance, make_machineless_step().arrays, np.zeros(0), LAW, rows)
+    return rows, bodies
 
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 1000), n_rows=st.integers(0, 300), n_rocks=st.integers(2, 60))
 def test_batches_hold_every_row_once_and_no_rock_twice(seed, n_rows, n_rocks):
-    _, body_a, body_b, _ = draw_rows(np.random.default_rng(seed), n_rows, n_rocks)
+    drawn, _ = draw_rows(np.random.default_rng(seed), n_rows, n_rocks)
     arrays = batches.make_batch_arrays(n_rows)
     marks = np.zeros(n_rocks + 1, np.int64)
-    n = batches.make_batches(np.arange(n_rows), body_a, body_b, n_rocks, marks, arrays.members, 0)
+    n = batches.make_batches(np.arange(n_rows), drawn.body_a, drawn.body_b, n_rocks, 0, arrays.members, marks)
     assert not marks.any()
     found = arrays.members[:n]
     assert sorted(found[found >= 0]) == list(range(n_rows))
     for batch in found:
         rows = batch[batch >= 0]
-        rocks = np.concatenate([body_a[rows], body_b[rows]])
+        rocks = np.concatenate([drawn.body_a[rows], drawn.body_b[rows]])
         rocks = rocks[rocks != n_rocks]
         assert len(rocks) == len(set(rocks))
 
@@ -64,27 +70,26 @@ def test_no_vector_of_a_batch_lies_across_two_lines_of_the_cache():
 def test_a_batch_is_updated_like_its_rows_one_by_one():
     """Sticking, sliding and parting contacts: sixteen at once in single precision, against the scalar update."""
     rng = np.random.default_rng(3)
-    rows, body_a, body_b, bodies = draw_rows(rng, 400, 60)
-    arrays = batches.make_batch_arrays(len(rows))
-    n = batches.make_batches(
-        np.arange(len(rows)), body_a, body_b, 60, np.zeros(61, np.int64), arrays.members, 0
-    )
-    batches.pack(rows, body_a, body_b, 60, arrays, n)
-    single = bodies.astype(np.float32)
+    rows, bodies = draw_rows(rng, 400, 60)
+    arrays, marks = batches.make_batch_arrays(400), np.zeros(61, np.int64)
+    n = batches.make_batches(np.arange(400), rows.body_a, rows.body_b, 60, 0, arrays.members, marks)
+    batches.pack(rows, 60, n, arrays)
+    single = batches.make_single_bodies(61)
+    for k in range(61):
+        copy_body(bodies[k], single.values[k])
     change = 0.0
     for k in range(n):
-        batches.solve_batch(arrays, k, single)
+        batches.solve_batch(k, arrays, single.matrix)
         for row in arrays.members[k][arrays.members[k] >= 0]:
-            change += abs(solver.solve_contact(rows[row], bodies[body_a[row]], bodies[body_b[row]]))
-    solved = rows.copy()
+            a, b = bodies[rows.body_a[row]], bodies[rows.body_b[row]]
+            change += abs(solve_contact(rows.values[row], a, b))
+    solved = rows._replace(values=rows.values.copy())
     batches.unpack_impulses(arrays, n, solved)
-    impulses = slice(contacts.IMPULSE, contacts.IMPULSE + 3)
-    np.testing.assert_allclose(solved[:, impulses], rows[:, impulses], atol=2e-3)
-    np.testing.assert_allclose(single, bodies, atol=1e-3)
+    impulses = rows.values["impulse"]
+    np.testing.assert_allclose(solved.values["impulse"], impulses, atol=2e-3)
+    for name in ("angular", "linear"):
+        np.testing.assert_allclose(single.values[name], bodies[name], atol=1e-3)
     assert arrays.changes.sum() == pytest.approx(change, rel=1e-3)
-    normal, slip = (
-        rows[:, contacts.IMPULSE],
-        np.hypot(*rows[:, contacts.IMPULSE + 1 : contacts.IMPULSE + 3].T),
-    )
+    normal, slip = impulses[:, 0], np.hypot(*impulses[:, 1:].T)
     slides = slip > 0.799 * normal
     assert min((normal == 0).sum(), (slides & (normal > 0)).sum(), (~slides).sum()) > 20

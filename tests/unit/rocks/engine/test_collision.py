@@ -21,6 +21,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from drakerock.rocks.config import RocksConfig
+from drakerock.rocks.engine.collision.geometry import Core
 from drakerock.rocks.engine.collision.gjk import (
     NEAR,
     OVERLAPPING,
@@ -31,7 +32,7 @@ from drakerock.rocks.engine.collision.gjk import (
     make_gjk_workspace,
 )
 from drakerock.rocks.engine.collision.manifold import make_manifold, make_manifold_workspace
-from drakerock.rocks.engine.collision.overlap import calc_core_penetration
+from drakerock.rocks.engine.collision.penetration import calc_core_penetration
 from drakerock.rocks.engine.collision.shapes import make_convex_shapes
 from drakerock.rocks.shapes import load_rock_shapes, sample_rock_points
 
@@ -57,10 +58,11 @@ def draw_pair(rng, reach):
 
 def search_distance(shapes, r_a, r_b, p, max_distance=100.0, guess=None, simplex=0, scale_b=1.0):
     guess = p if guess is None else guess
-    return calc_core_distance(
-        shapes, 0, 1.0, flat(r_a), 1, scale_b, flat(r_b), *map(float, p), *map(float, guess),
-        simplex, max_distance, make_gjk_workspace(),
+    status, v, on_a, simplex = calc_core_distance(
+        shapes, Core(0, 1.0, flat(r_a)), Core(1, scale_b, flat(r_b)), flat(p), flat(guess), simplex, max_distance,
+        make_gjk_workspace(),
     )  # fmt: skip
+    return status, *v, *on_a, simplex
 
 
 def calc_distance(*args, **kwargs):
@@ -68,9 +70,9 @@ def calc_distance(*args, **kwargs):
 
 
 def calc_penetration(shapes, r_a, r_b, p, history=(0.0, 0.0, 0.0), min_cosine=0.5):
-    return calc_core_penetration(
-        shapes, 0, 1.0, flat(r_a), 1, 1.0, flat(r_b), *map(float, p), *map(float, history), min_cosine
-    )
+    a, b = Core(0, 1.0, flat(r_a)), Core(1, 1.0, flat(r_b))
+    separation, n, on_a = calc_core_penetration(shapes, a, b, flat(p), flat(history), min_cosine)
+    return separation, *n, *on_a
 
 
 def calc_distance_by_program(a, b):
@@ -258,9 +260,8 @@ def calc_manifold(shapes, r_a, r_b, p, max_gap=0.005, scale_b=1.0, known=()):
     points = np.zeros((4, 4))
     points[0] = [*(np.array([ax, ay, az]) + n * (shapes.rounding[0] + 0.5 * gap)), gap]
     count = make_manifold(
-        shapes, 0, 1.0, flat(r_a), 1, scale_b, flat(r_b), *map(float, p), *map(float, n),
-        max(max_gap, gap), 0.985, np.array(known, float).reshape(-1, 3), len(known), points,
-        make_manifold_workspace(),
+        shapes, Core(0, 1.0, flat(r_a)), Core(1, scale_b, flat(r_b)), flat(p), flat(n), max(max_gap, gap), 0.985,
+        np.array(known, float).reshape(-1, 3), len(known), points, make_manifold_workspace(),
     )  # fmt: skip
     return n, points[:count]
 

@@ -1,4 +1,4 @@
-"""Broad phase, contact memory, solver, reduction and failures of the nonsmooth engine, each alone."""
+"""Broad phase, contact cache, solve, sleeping and failures of the nonsmooth engine, each alone."""
 
 from __future__ import annotations
 
@@ -16,12 +16,25 @@ from scipy.spatial.transform import Rotation
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.rocks.config import RocksConfig
 from drakerock.rocks.drake.interface import ROCK_SUMMARY
-from drakerock.rocks.engine import contacts, motion, reduction, solver
+from drakerock.rocks.engine import contact_cache, sleeping
 from drakerock.rocks.engine import engine as engine_module
 from drakerock.rocks.engine.collision import gjk
-from drakerock.rocks.engine.collision.broad_phase import AWAKE, LOST, RESTING
 from drakerock.rocks.engine.config import NonsmoothConfig, RestConfig
 from drakerock.rocks.engine.engine import DEEP_SHARE, MachinePiece, MachineStep, make_machineless_step
+from drakerock.rocks.engine.records import (
+    AWAKE,
+    BODY,
+    LOST,
+    NEW,
+    SEARCHED,
+    SENSOR,
+    SLEEP,
+    SLEEPING,
+    as_records,
+)
+from drakerock.rocks.engine.solve.rows import KEY_STEP, make_contact_rows
+from drakerock.rocks.engine.solve.spin_damping import damp_spin
+from drakerock.rocks.engine.vectors import rotate_quaternion
 from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.state import load_pile, save_pile
 from rock_helpers import (
@@ -57,15 +70,15 @@ def test_broad_phase_finds_every_pair_of_boxes_that_meet(seed):
     engine = make_engine(pile, SHAPES, make_plane_site(planes=5))
     arrays = engine.make_arrays(pile)
     rng = np.random.default_rng(seed)
-    arrays.book[rng.random(len(pile)) < 0.4, reduction.STATUS] = 1  # some at rest
-    status = arrays.book[:, reduction.STATUS].astype(np.int64)
-    engine._pose(arrays, make_machineless_step(), status)
-    n_pairs = engine._find_pairs(status)
-    found = [
-        (int(a), int(b)) for a, b in zip(engine._pair_a[:n_pairs], engine._pair_b[:n_pairs], strict=True)
-    ]
+    status = np.where(rng.random(len(pile)) < 0.4, SLEEPING, AWAKE)
+    state, detection = (arrays.quaternions, arrays.positions), engine.detection
+    detection.modes[: len(pile)] = SEARCHED
+    stale, machine = detection.find_stale(status, *state), make_machineless_step()
+    detection.update_poses(stale, status, *state, arrays.velocities, machine.X_WBs, np.zeros((0, 6)), 0.005)
+    n_pairs = detection.find_pairs(status)
+    found = [(int(a), int(b)) for a, b in np.transpose(detection.pairs)[:n_pairs]]
     assert len(found) == len(set(found))
-    lower, upper = engine._lower, engine._upper
+    lower, upper = detection.boxes
     expected = {
         (i, j)
         for i in range(len(pile))
@@ -98,8 +111,7 @@ def test_frictionless_contacts_agree_with_a_quadratic_program():
     arrays = engine.make_arrays(pile)
     new, report = engine.step(arrays, make_machineless_step())
     assert report.n_loaded >= 4
-    rows = engine._rows.values[: report.n_contacts]
-    normals, gaps = rows[:, contacts.NORMAL : contacts.NORMAL + 3], rows[:, contacts.GAP]
+    rows = engine.detection.rows.values[: report.n_contacts]
     # v minimises 1/2 (v - v_free)^T M (v - v_free) with G v >= bias, translations and rotations
     program = MathematicalProgram()
     v = program.NewContinuousVariables(6 * n)
@@ -107,7 +119,7 @@ def test_frictionless_contacts_agree_with_a_quadratic_program():
     free = pile.V_WRs.copy()
     free[:, 5] -= 9.81 * engine.time_step
     for i in range(n):
-        inverse = engine._inverse_inertia[i]
+        inverse = engine.detection.inverse_inertia[i]
         inertia = np.linalg.inv(
             [
                 [inverse[0], inverse[1], inverse[2]],
@@ -120,41 +132,39 @@ def test_frictionless_contacts_agree_with_a_quadratic_program():
     program.AddQuadraticCost(mass, -mass @ free.reshape(-1), v, is_convex=True)
     for k in range(len(rows)):
         g = np.zeros(6 * n)
-        a, b = engine._rows.body_a[k], engine._rows.body_b[k]
-        g[6 * a : 6 * a + 6] = -np.concatenate([np.cross(rows[k, 9:12], normals[k]), normals[k]])
+        a, b, row = engine.detection.rows.body_a[k], engine.detection.rows.body_b[k], rows[k]
+        g[6 * a : 6 * a + 6] = -np.concatenate([np.cross(row["arm_a"], row["normal"]), row["normal"]])
         if b < n:
-            g[6 * b : 6 * b + 6] += np.concatenate([np.cross(rows[k, 12:15], normals[k]), normals[k]])
-        program.AddLinearConstraint(g[None], [rows[k, contacts.BIAS]], [np.inf], v)
-        assert gaps[k] > 0 or rows[k, contacts.COMPLIANCE] < 1e-3
+            g[6 * b : 6 * b + 6] += np.concatenate([np.cross(row["arm_b"], row["normal"]), row["normal"]])
+        program.AddLinearConstraint(g[None], [row["bias"]], [np.inf], v)
+        assert row["gap"] > 0 or row["compliance"] < 1e-3
     expected = ClarabelSolver().Solve(program).GetSolution(v).reshape(n, 6)
     np.testing.assert_allclose(new.velocities[:, 3:], expected[:, 3:], atol=5e-3)
 
 
-def test_contact_memory_is_found_again():
+def test_cached_contacts_are_found_again():
     """A box at rest: the second step starts from the first one's impulses."""
     pile = make_pile([[0, 0, 0.25]])
-    # Momentum rings on in single precision: 3e-5 of the weight across it.
+    # Acceleration rings on in single precision: 3e-5 of the weight across it.
     engine = make_engine(
         pile, [make_box(0.8, 0.6, 0.5)], config=NonsmoothConfig(reduction="none", momentum=0.0)
     )
     arrays, _ = run(engine, engine.make_arrays(pile), 0.5)
-    assert len(arrays.memory.pairs) == 4
-    sums, pressures = np.zeros((1, 3)), np.zeros(1)
-    contacts.sum_impulses(arrays.memory, 1, sums)
+    assert len(arrays.cache.pairs) == 4
+    sums = np.zeros((1, 3))
+    contact_cache.sum_impulses(arrays.cache, 1, sums)
     np.testing.assert_allclose(sums[0], [0, 0, engine.mass[0] * 9.81 * 0.01], rtol=1e-6, atol=1e-6)
-    impulses = arrays.memory.values[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3]
-    contacts.sum_pressures(arrays.memory, 1, np.ones(1, bool), pressures)
-    assert pressures[0] == pytest.approx(0.5 * np.linalg.norm(impulses, axis=1).sum(), rel=1e-5)
     table = np.zeros(128, np.int64)
     status, active = np.zeros(1, np.int64), np.zeros(8, np.int64)
-    assert contacts.index_memory(arrays.memory, 1, status, active, table) == (64, 4, 0)
+    assert contact_cache.index_cache(arrays.cache, 1, status, active, table) == (64, 4, 0)
     table = table[:64]
-    key = contacts.read_key(arrays.memory, 0)
-    assert contacts.find_in_memory(key, arrays.memory, table) == 0
-    assert contacts.find_in_memory(key + 1, arrays.memory, table) == -1
+    key = contact_cache.read_key(arrays.cache, 0)
+    assert contact_cache.find_in_cache(key, arrays.cache, table) == 0
+    assert contact_cache.count_points(key, arrays.cache, 0) == 4
+    assert contact_cache.find_in_cache(key + 1, arrays.cache, table) == -1
     # pairs without an awake rock are not searched
-    assert contacts.index_memory(arrays.memory, 1, status + 1, active, table) == (64, 0, 0)
-    assert contacts.find_in_memory(key, arrays.memory, table) == -1
+    assert contact_cache.index_cache(arrays.cache, 1, status + SLEEPING, active, table) == (64, 0, 0)
+    assert contact_cache.find_in_cache(key, arrays.cache, table) == -1
 
 
 def settle(n=25, seed=0):
@@ -179,17 +189,18 @@ def test_a_stored_pile_starts_warm(tmp_path):
     again = engine.make_arrays(loaded)
     for name in ("positions", "quaternions", "velocities"):
         assert np.array_equal(getattr(arrays, name), getattr(again, name))
-    loaded_rows = arrays.memory.values[:, contacts.MEMORY_IMPULSE : contacts.MEMORY_IMPULSE + 3].any(axis=1)
-    assert len(again.memory.pairs) == loaded_rows.sum()
+    loaded_points = arrays.cache.points["impulse"].any(axis=1)
+    assert len(again.cache.pairs) == loaded_points.sum()
     # A pile keeps contact points and impulses in single precision, in memory as in the file: what was stored goes on
     # like what was not, bit for bit.
     kept = engine.make_arrays(pile)
-    for one, other in zip(again.memory, kept.memory, strict=True):
+    for one, other in zip(again.cache, kept.cache, strict=True):
         assert np.array_equal(one, other)
     # Where searches ended is not stored.
-    stored, columns = arrays.memory.select(loaded_rows), slice(contacts.MEMORY_SIMPLEX)
-    assert np.array_equal(again.memory.pairs, stored.pairs)
-    assert np.allclose(again.memory.values[:, columns], stored.values[:, columns], rtol=1e-6, atol=1e-6)
+    stored = arrays.cache.select(loaded_points)
+    assert np.array_equal(again.cache.pairs, stored.pairs)
+    for name in ("point", "impulse"):
+        assert np.allclose(again.cache.points[name], stored.points[name], rtol=1e-6, atol=1e-6)
     # all awake, it stays where it is; without the contacts it sinks and jumps more
     moved = {}
     for name, start in (("warm", loaded), ("cold", replace(loaded, contacts=None))):
@@ -219,12 +230,12 @@ def test_contacts_follow_the_rocks_they_belong_to():
 
 def test_rocks_rest_keep_their_forces_and_wake_when_their_load_changes():
     engine, arrays = settle()
-    status = arrays.book[:, reduction.STATUS]
-    assert (status == 1).mean() > 0.8
-    before = [(*pair, *values) for pair, values in zip(*arrays.memory, strict=True)]
+    status = arrays.status
+    assert (status == SLEEPING).mean() > 0.8
+    before = _list_points(arrays.cache)
     after, _ = run(engine, arrays, 0.2)
     both_rest = [row for row in before if _rests(row, status, engine.n_rocks)]
-    kept = {(*pair, *values) for pair, values in zip(*after.memory, strict=True)}
+    kept = set(_list_points(after.cache))
     assert both_rest
     assert kept.issuperset(both_rest)
     # a heavy rock dropped on the heap wakes what it lands on
@@ -239,33 +250,38 @@ def test_rocks_rest_keep_their_forces_and_wake_when_their_load_changes():
     assert woken >= 2
 
 
+def _list_points(cache):
+    return [(*pair, point.tobytes()) for pair, point in zip(*cache, strict=True)]
+
+
 def _rests(row, status, n):
     a, b = row[:2]
-    return status[a] == 1 and (b >= n or status[b] == 1)
+    return status[a] == SLEEPING and (b >= n or status[b] == SLEEPING)
 
 
 def test_contacts_of_slow_rocks_follow_their_motion():
     """A heap nudged to millimetres a second: what steps without a search make of the gaps is what a search finds."""
     engine, arrays = settle(n=60, seed=2)
     rng = np.random.default_rng(0)
-    arrays.book[:, reduction.STATUS] = AWAKE
+    arrays.sleep["status"] = AWAKE
     arrays.velocities[:, 3:] += rng.uniform(-4e-3, 4e-3, (engine.n_rocks, 3))
-    arrays.book[:, reduction.WAY] = np.inf
+    arrays.sleep["way"] = np.inf
     engine.config = NonsmoothConfig(reduction="none")
     searched = []
     for _ in range(4):
-        arrays, _ = engine.advance(arrays)
-        searched.append(engine._statistics[1])
+        arrays, report = engine.advance(arrays)
+        searched.append(report.n_distances)
     assert searched[0] > 20
     assert searched[1:] == [0, 0, 0]
     engine.config = NonsmoothConfig(reduction="none", search_period=1)
     _, report = engine.advance(arrays)
-    keys, rows = engine._rows.key[: report.n_contacts], engine._rows.values[: report.n_contacts]
-    memory_keys = np.array([contacts.read_key(arrays.memory, row) for row in range(len(arrays.memory.pairs))])
-    pairs = np.intersect1d(keys, memory_keys)
+    rows, cache = engine.detection.rows, arrays.cache
+    keys, gaps = rows.key[: report.n_contacts], rows.values["gap"][: report.n_contacts]
+    cached_keys = np.array([contact_cache.read_key(cache, row) for row in range(len(cache.pairs))])
+    pairs = np.intersect1d(keys, cached_keys)
     assert len(pairs) > 60
-    found = [rows[keys == key, contacts.GAP].min() for key in pairs]
-    followed = [arrays.memory.values[memory_keys == key, contacts.MEMORY_GAP].min() for key in pairs]
+    found = [gaps[keys == key].min() for key in pairs]
+    followed = [cache.points["gap"][cached_keys == key].min() for key in pairs]
     np.testing.assert_allclose(followed, found, atol=2e-5)
 
 
@@ -277,12 +293,12 @@ def test_contacts_of_slow_rocks_follow_their_motion():
 def test_how_often_rocks_that_move_together_are_searched(speed, searches):
     pile = make_pile([[0, 0, 2.0], [0.5005, 0, 2.0]], velocities=[[0, 0, 0, speed, 0, 0]] * 2)
     engine = make_engine(
-        pile, [make_box(0.5, 0.5, 0.5)], config=NonsmoothConfig(reduction="none"), gravity=0.0
+        pile, [make_box(0.5, 0.5, 0.5)], config=NonsmoothConfig(reduction="none"), gravity=np.zeros(3)
     )
     arrays, n_searches = engine.make_arrays(pile), 0
     for _ in range(100):
         arrays, report = engine.advance(arrays)
-        n_searches += engine._statistics[1] > 0
+        n_searches += report.n_distances > 0
         assert report.n_contacts == 4
     assert n_searches == pytest.approx(searches, abs=1)
 
@@ -306,13 +322,13 @@ def test_a_rock_that_strikes_is_searched_at_once():
 def test_a_step_into_given_room_is_the_same_step():
     engine, arrays = settle()
     arrays.velocities[:, 5] += 0.2
-    arrays.book[:, reduction.STATUS] = np.where(np.arange(engine.n_rocks) % 3 > 0, AWAKE, 1)
+    arrays.sleep["status"] = np.where(np.arange(engine.n_rocks) % 3 > 0, AWAKE, SLEEPING)
     arrays.velocities[::3] = 0.0
     groups = {name: value for name, value in vars(arrays).items() if isinstance(value, np.ndarray)}
     before = replace(arrays, **{name: value.copy() for name, value in groups.items()})
     room = engine.make_room()
     for name in groups:
-        getattr(room, name)[:] = np.nan
+        getattr(room, name).view(float)[:] = np.nan
     expected, _ = engine.advance(arrays)
     result, report = engine.step(arrays, make_machineless_step(), room)
     still = np.setdiff1d(np.arange(engine.n_rocks), report.awake)
@@ -334,48 +350,48 @@ def test_a_step_into_given_room_is_the_same_step():
 def wake_by_and_by(engine, arrays, woken):
     """Yield the states of steps that begin with each of the rocks `woken` shoved in turn, and the reports."""
     for rock in woken:
-        reduction.wake_rock(arrays.book, arrays.positions, rock)
+        sleeping.wake_rock(rock, arrays.positions, arrays.sleep)
         arrays.velocities[rock, 5] = 0.02
         arrays, report = engine.advance(arrays)
         yield arrays, report
 
 
 def is_gap(arrays):
-    return arrays.memory.pairs[:, 0] < 0
+    return arrays.cache.pairs[:, 0] < 0
 
 
 def settle_at_rest():
-    """Return 200 rocks that have come to rest, memory of resting rocks written, and their engine."""
+    """Return 200 rocks that have fallen asleep, their contacts in the cache, and their engine."""
     engine, arrays = settle(200)
-    arrays.book[:, reduction.STATUS], arrays.book[:, reduction.CHANGED_STEPS] = RESTING, reduction.NEW
+    arrays.sleep["status"], arrays.sleep["changed_steps"] = SLEEPING, NEW
     arrays.velocities[:] = 0.0
     arrays, _ = engine.advance(arrays)
-    assert arrays.n_idle == len(arrays.memory.pairs) > 200
+    assert arrays.n_sleeping == len(arrays.cache.pairs) > 200
     return engine, arrays
 
 
-def test_what_rocks_at_rest_remember_stays_in_its_place_and_gaps_change_nothing():
+def test_contacts_of_sleeping_rocks_stay_in_their_place_and_gaps_change_nothing():
     engine, arrays = settle_at_rest()
     n_gaps = [0]
     for new, report in wake_by_and_by(engine, arrays, range(0, 200, 5)):
         gaps = is_gap(arrays)
         closed = replace(
-            arrays, memory=arrays.memory.select(~gaps), n_idle=int((~gaps[: arrays.n_idle]).sum())
+            arrays, cache=arrays.cache.select(~gaps), n_sleeping=int((~gaps[: arrays.n_sleeping]).sum())
         )
         expected, _ = engine.advance(closed)
-        for name in ("positions", "quaternions", "velocities", "book"):
+        for name in ("positions", "quaternions", "velocities", "sleep"):
             assert np.array_equal(getattr(new, name), getattr(expected, name)), name
-        for found, whole in zip(new.memory.select(~is_gap(new)), expected.memory, strict=True):
-            assert np.array_equal(found, whole[expected.memory.pairs[:, 0] >= 0])
+        for found, whole in zip(new.cache.select(~is_gap(new)), expected.cache, strict=True):
+            assert np.array_equal(found, whole[expected.cache.pairs[:, 0] >= 0])
         assert np.array_equal(
             engine.make_pile(new).contacts.impulses, engine.make_pile(expected).contacts.impulses
         )
         kept = np.setdiff1d(np.arange(report.n_kept), report.freed)
-        assert np.array_equal(new.memory.pairs[kept], arrays.memory.pairs[kept])
+        assert np.array_equal(new.cache.pairs[kept], arrays.cache.pairs[kept])
         assert is_gap(new)[report.freed].all()
-        assert not is_gap(new)[new.n_idle :].any()
+        assert not is_gap(new)[new.n_sleeping :].any()
         n_gaps.append(int(is_gap(new).sum()))
-        assert n_gaps[-1] <= new.n_idle / contacts.MAX_GAPS
+        assert n_gaps[-1] <= new.n_sleeping / contact_cache.MAX_GAPS
         arrays = new
     # They become more, are closed, and become more again.
     assert max(n_gaps) > 5
@@ -384,28 +400,28 @@ def test_what_rocks_at_rest_remember_stays_in_its_place_and_gaps_change_nothing(
 
 def test_changes_written_into_a_copy_are_the_whole_state():
     engine, arrays = settle_at_rest()
-    capacity = len(engine.make_room().memory.pairs)
+    capacity = len(engine.make_room().cache.pairs)
     for new, _ in wake_by_and_by(engine, arrays, range(0, 200, 20)):
         copy = replace(
             arrays,
             **{
                 name: getattr(arrays, name).copy()
-                for name in ("positions", "quaternions", "velocities", "book")
+                for name in ("positions", "quaternions", "velocities", "sleep")
             },
-            memory=contacts.make_memory(capacity),
+            cache=contact_cache.make_contact_cache(capacity),
         )
-        for before, after in zip(copy.memory, arrays.memory, strict=True):
+        for before, after in zip(copy.cache, arrays.cache, strict=True):
             before[: len(after)] = after
         room = engine.make_room()
-        room.memory.pairs[:], room.memory.values[:] = 7, np.nan
+        room.cache.pairs[:], room.cache.points["impulse"] = 7, np.nan
         engine.write_changes(*engine.step(arrays, make_machineless_step(), room), copy)
-        for name in ("positions", "quaternions", "velocities", "book"):
+        for name in ("positions", "quaternions", "velocities", "sleep"):
             assert np.array_equal(getattr(copy, name), getattr(new, name)), name
         # What stands in a gap counts for nothing.
         full = ~is_gap(new)
-        for found, whole in zip(copy.memory.select(slice(len(full))), new.memory, strict=True):
+        for found, whole in zip(copy.cache.select(slice(len(full))), new.cache, strict=True):
             assert np.array_equal(found[full], whole[full])
-        assert np.array_equal(copy.memory.pairs[: len(full), 0] < 0, ~full)
+        assert np.array_equal(copy.cache.pairs[: len(full), 0] < 0, ~full)
         arrays = new
 
 
@@ -425,74 +441,58 @@ def test_two_contexts_keep_their_solutions_apart():
     assert np.array_equal(system.get_pile(simulator.get_context()).p_WRs, expected.positions)
 
 
-def test_memory_keeps_keys_and_simplices_whole():
-    """A simplex takes two columns of single precision; the largest numbers have to come back."""
-    memory = contacts.make_memory(1)
-    rows = contacts.make_contact_rows(1)
+def test_the_cache_keeps_keys_and_simplices_whole():
+    """A simplex takes two numbers of single precision; the largest ones have to come back."""
+    cache, rows = contact_cache.make_contact_cache(1), make_contact_rows(1)
     corners = np.array([[127, 126], [125, 127], [127, 127]])
-    rows.values[0, [contacts.IMPULSE, contacts.SIMPLEX]] = 1.0, gjk.encode_simplex(corners, 3)
-    rock = contacts.KEY_STEP - 2
-    rows.key[0] = key = rock * contacts.KEY_STEP + contacts.KEY_STEP - 1
-    rotations = np.zeros((contacts.KEY_STEP, 3, 3))
+    rows.values["impulse"][0, 0], rows.values["simplex"] = 1.0, gjk.encode_simplex(corners, 3)
+    rock = KEY_STEP - 2
+    rows.key[0] = key = rock * KEY_STEP + KEY_STEP - 1
+    rotations = np.zeros((KEY_STEP, 3, 3))
     rotations[rock] = np.eye(3)
     empty = np.zeros(0, np.int64)
-    n, n_idle, n_kept = contacts.write_memory(
-        0,
-        contacts.make_memory(0),
-        0,
-        empty,
-        0,
-        0,
-        rows,
-        1,
-        rotations,
-        np.zeros((contacts.KEY_STEP, 6)),
-        0.01,
-        0.0,
-        memory,
-    )
-    assert (n, n_idle, n_kept) == (1, 0, 0)
-    assert contacts.read_key(memory, 0) == key
+    index, old = contact_cache.CacheIndex(empty, empty, 0, 0), contact_cache.make_contact_cache(0)
+    velocities = np.zeros((KEY_STEP, 6))
+    written = contact_cache.write_cache(0, old, 0, index, 1, rows, rotations, velocities, 0.01, 0.0, cache)
+    assert written == (1, 0, 0)
+    assert contact_cache.read_key(cache, 0) == key
     found = np.zeros((3, 2), np.int64)
-    assert gjk.decode_simplex(contacts.read_simplex(memory, 0), found) == 3
+    assert gjk.decode_simplex(contact_cache.read_simplex(cache.points[0]), found) == 3
     assert np.array_equal(found, corners)
 
 
 def test_without_reduction_nothing_rests():
     engine, arrays = settle()
-    assert (arrays.book[:, reduction.STATUS] == 1).any()
+    assert (arrays.status == SLEEPING).any()
     engine.config = NonsmoothConfig(reduction="none")
     after, report = engine.advance(arrays)
     assert report.n_awake == engine.n_rocks
-    assert not after.book[:, reduction.STATUS].any()
+    assert not after.status.any()
+
+
+def make_thresholds(load, share, near_movers, steps=1):
+    return sleeping.WakeThresholds(load, share, near_movers, steps)
+
+
+NOWHERE = np.zeros(0, SENSOR)
 
 
 def test_the_sensor_wakes_what_is_in_its_box():
     engine, arrays = settle()
-    book = arrays.book.copy()
-    book[:, reduction.STATUS] = 1
-    sums = np.zeros((len(book), 3))
-    contacts.sum_impulses(arrays.memory, len(book), sums)
-    book[:, reduction.REFERENCE : reduction.REFERENCE + 3] = sums
+    sleep = arrays.sleep.copy()
+    sleep["status"] = SLEEPING
+    sums = np.zeros((len(sleep), 3))
+    contact_cache.sum_impulses(arrays.cache, len(sleep), sums)
+    sleep["reference"] = sums
     box = np.concatenate([np.eye(3).reshape(-1), np.zeros(3), [-10, -10, -1], [0.0, 10, 10]])
-    alone = np.zeros(len(book), np.bool_)
-    n = reduction.wake(
-        book,
-        arrays.positions,
-        engine.radius,
-        engine.mass,
-        arrays.memory,
-        0,
-        box[None],
-        alone,
-        0.1,
-        0.1,
-        0.1,
-        3,
-    )
+    alone = np.zeros(len(sleep), np.bool_)
+    n = sleeping.wake(
+        arrays.positions, engine.radius, engine.mass, arrays.cache, 0, as_records(box[None], SENSOR), alone,
+        make_thresholds(0.1, 0.1, 0.1, 3), sleep,
+    )  # fmt: skip
     inside = arrays.positions[:, 0] < engine.radius
     assert n == inside.sum()
-    assert ((book[:, reduction.STATUS] == 0) == inside).all()
+    assert ((sleep["status"] == AWAKE) == inside).all()
 
 
 def test_rocks_that_leave_the_site_are_counted_and_taken_out():
@@ -500,19 +500,19 @@ def test_rocks_that_leave_the_site_are_counted_and_taken_out():
     engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)])
     arrays, report = engine.advance(engine.make_arrays(pile))
     assert report.n_lost == 1
-    assert arrays.book[1, reduction.STATUS] == 3
+    assert arrays.status[1] == LOST
     assert not arrays.velocities[1].any()
     _, report = engine.advance(arrays)
     assert report.n_lost == 0
     assert report.n_awake == 1
 
 
-@pytest.mark.parametrize("status", [AWAKE, RESTING])
+@pytest.mark.parametrize("status", [AWAKE, SLEEPING])
 def test_values_that_are_not_finite_do_not_leave_a_step(status):
     pile = make_pile([[0, 0, 0.25], [2.0, 0, 0.25]])
     engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)])
     arrays = engine.make_arrays(pile)
-    arrays.book[0, reduction.STATUS] = status
+    arrays.sleep["status"][0] = status
     arrays, _ = engine.advance(arrays)
     # The velocities of resting rocks are nowhere read.
     for group in (arrays.positions, arrays.quaternions, *[arrays.velocities] * (status == AWAKE)):
@@ -546,8 +546,8 @@ def test_a_step_that_does_not_converge_is_redone_then_fails(fails):
         assert report.residual == residuals[1]
 
 
-def test_momentum_does_not_leave_a_sliding_rock_in_a_cycle():
-    """A rock slides along another and the floor: with momentum to the last, impulses go to and fro for ever (0.4)."""
+def test_acceleration_does_not_leave_a_sliding_rock_in_a_cycle():
+    """A rock slides along another and the floor: accelerated to the last, impulses go to and fro for ever (0.4)."""
     pile = make_pile(
         [[-2.17279, -1.23646, 0.21966], [-2.51947, -0.66742, 0.2912]],
         shape=[2, 0],
@@ -610,12 +610,12 @@ def push_light_rocks(speed, **settings):
     )
     config = NonsmoothConfig(reduction="none", max_residual=1e9, rounding=1e-6, **settings)
     engine = make_engine(
-        pile, [make_box(1, 1, 1)], config=config, gravity=0.0, pieces=[piece], n_machine_bodies=1
+        pile, [make_box(1, 1, 1)], config=config, gravity=np.zeros(3), pieces=[piece], n_machine_bodies=1
     )
     return engine, engine.step(engine.make_arrays(pile), ram)[1]
 
 
-def test_sweeps_around_the_machine_bring_its_momentum_through_light_rocks():
+def test_iterations_about_the_machine_bring_its_momentum_through_light_rocks():
     left = {}
     for sweeps, iterations in ((0, 50), (3, 50), (0, 200), (0, 2000)):
         engine, report = push_light_rocks(0.3, machine_sweeps=sweeps, iterations=iterations, momentum=0.0)
@@ -630,7 +630,7 @@ def test_sweeps_around_the_machine_bring_its_momentum_through_light_rocks():
     assert brought[3, 50] == pytest.approx(brought[0, 200], rel=0.15)
 
 
-def test_momentum_is_worth_many_sweeps():
+def test_acceleration_is_worth_many_iterations():
     def calc_brought(iterations, momentum, machine_sweeps=0):
         settings = {"iterations": iterations, "momentum": momentum, "machine_sweeps": machine_sweeps}
         _, report = push_light_rocks(0.3, **settings)
@@ -644,7 +644,7 @@ def test_momentum_is_worth_many_sweeps():
 
 def test_deep_overlap_recovers_slowly():
     pile = make_pile([[0, 0, 5.0], [0.1, 0.05, 5.2]])
-    engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)], gravity=0.0)
+    engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)], gravity=np.zeros(3))
     arrays = engine.make_arrays(pile)
     fastest = 0.0
     arrays, report = engine.advance(arrays)
@@ -662,7 +662,7 @@ def test_deep_overlap_recovers_slowly():
 def test_turning_is_the_exponential_map(vector, seed):
     start = Rotation.random(random_state=seed)
     q = start.as_quat(scalar_first=True)
-    turned = Rotation.from_quat(motion.turn(*q, *vector), scalar_first=True)
+    turned = Rotation.from_quat(rotate_quaternion(tuple(q), tuple(vector)), scalar_first=True)
     expected = Rotation.from_rotvec(vector) * start
     assert (turned * expected.inv()).magnitude() < 1e-9
 
@@ -679,6 +679,15 @@ def test_settings_are_checked():
         NonsmoothConfig(manifold_gap=0.05)
     with pytest.raises(ValueError, match="wake_load"):
         RestConfig(wake_load=0.0)
+
+
+def test_the_schema_marks_all_but_a_users_settings_as_advanced():
+    schema = NonsmoothConfig.model_json_schema()
+    groups = [schema["properties"], schema["$defs"]["RestConfig"]["properties"]]
+    plain = [name for group in groups for name, item in group.items() if not item.get("advanced")]
+    assert plain == [
+        "iterations", "stiffness_factor", "linear_overlap", "rounding", "reduction", "rest", "max_penetration"
+    ]  # fmt: skip
 
 
 def test_a_damaged_pile_file_is_refused(tmp_path):
@@ -728,29 +737,29 @@ def test_the_system_runs_without_a_machine_and_steps_as_the_engine_does():
 )
 def test_spin_damping_slows_and_keeps_angular_momentum(spins, share, fixed):
     """Two rocks with one contact, or a rock on the floor: the share of the spin goes, momentum stays."""
-    bodies = np.zeros((3, solver.BODY_WIDTH))
+    bodies, rows = np.zeros(3, BODY), make_contact_rows(1)
     inertia = np.array([[2.0, 0.3, -0.1, 3.0, 0.2, 4.0], [1.0, 0.1, 0.2, 1.5, -0.1, 2.0]])
-    bodies[:2, solver.INVERSE_INERTIA : solver.INVERSE_INERTIA + 6] = inertia
-    bodies[:2, :3] = np.reshape(spins, (2, 3))
-    rows = np.zeros((1, contacts.ROW_WIDTH))
-    a, b = np.array([0]), np.array([2 if fixed else 1])
+    bodies["inverse_inertia"][:2] = inertia
+    bodies["angular"][:2] = np.reshape(spins, (2, 3))
+    rows.body_b[0] = b = 2 if fixed else 1
     before = bodies.copy()
-    solver.damp_spin(rows, 1, a, b, bodies, 2, share)
+    damp_spin(1, rows, share, bodies)
     np.testing.assert_array_equal(bodies, before)  # no load, no damping
-    rows[0, contacts.IMPULSE] = 1.0
-    solver.damp_spin(rows, 1, a, b, bodies, 2, share)
+    rows.values["impulse"][0, 0] = 1.0
+    damp_spin(1, rows, share, bodies)
 
     def unfold(m):
         return np.linalg.inv(np.array([[m[0], m[1], m[2]], [m[1], m[3], m[4]], [m[2], m[4], m[5]]]))
 
-    old, new = before[b[0], :3] - before[0, :3], bodies[b[0], :3] - bodies[0, :3]
+    start, end = before["angular"], bodies["angular"]
+    old, new = start[b] - start[0], end[b] - end[0]
     np.testing.assert_allclose(new @ old, (1 - share) * (old @ old), atol=1e-9)
-    twist = [unfold(inertia[k]) @ (bodies[k, :3] - before[k, :3]) for k in range(2)]
+    twist = [unfold(inertia[k]) @ (end[k] - start[k]) for k in range(2)]
     if not fixed:
         np.testing.assert_allclose(twist[0], -twist[1], atol=1e-9)
-    energies = [0.5 * v[k, :3] @ unfold(inertia[k]) @ v[k, :3] for v in (before, bodies) for k in range(2)]
+    energies = [0.5 * v[k] @ unfold(inertia[k]) @ v[k] for v in (start, end) for k in range(2)]
     assert sum(energies[2:]) <= sum(energies[:2]) + 1e-9
-    np.testing.assert_array_equal(bodies[2], 0.0)
+    np.testing.assert_array_equal(end[2], 0.0)
 
 
 def test_spin_damping_stops_a_rock_that_swings_on_two_points():
@@ -781,68 +790,64 @@ def test_spin_damping_stops_a_rock_that_swings_on_two_points():
 def test_a_rock_under_pressure_wakes_by_a_share_of_it(squeeze, wakes):
     """A change of 0.31 times the weight: above 0.3 of it, and above a tenth of the pressure or not."""
     mass, weight = np.array([100.0]), 100.0 * 9.81 * 0.01
-    book = np.zeros((1, reduction.BOOK_WIDTH))
-    book[0, reduction.STATUS] = 1
-    book[0, reduction.REFERENCE + 2] = weight
+    sleep = np.zeros(1, SLEEP)
+    sleep["status"] = SLEEPING
+    sleep["reference"][0, 2] = weight
     # Squeezed between two walls, on a floor that carries 0.69 of its weight; half the sizes' sum is the pressure.
-    memory = contacts.make_memory(3)
-    memory.pairs[:, 1] = [1, 2, 3]
-    memory.values[:, contacts.MEMORY_IMPULSE] = [0.0, squeeze * weight, -squeeze * weight]
-    memory.values[0, contacts.MEMORY_IMPULSE + 2] = -0.69 * weight
-    nowhere = np.zeros((0, 18))
+    cache = contact_cache.make_contact_cache(3)
+    cache.pairs[:, 1] = [1, 2, 3]
+    cache.points["impulse"][:, 0] = [0.0, squeeze * weight, -squeeze * weight]
+    cache.points["impulse"][0, 2] = -0.69 * weight
     alone = np.zeros(1, np.bool_)
-    n = reduction.wake(
-        book, np.zeros((1, 3)), np.ones(1), mass, memory, 0, nowhere, alone, 0.3 * 9.81 * 0.01, 0.1, 0.1, 1
-    )
+    thresholds = make_thresholds(0.3 * 9.81 * 0.01, 0.1, 0.1)
+    n = sleeping.wake(np.zeros((1, 3)), np.ones(1), mass, cache, 0, NOWHERE, alone, thresholds, sleep)
     assert n == wakes
 
 
 @pytest.mark.parametrize("mover", [True, False])
-def test_a_rock_that_leans_on_a_mover_wakes_sooner_and_does_not_rest(mover):
+def test_a_rock_that_leans_on_a_mover_wakes_sooner_and_does_not_fall_asleep(mover):
     """Rock 0 slides at 2 cm/s or 5 mm/s, movers from 1 cm/s; rock 1 leans on it, rock 2 on rock 1."""
     mass, weight = np.full(3, 100.0), 100.0 * 9.81 * 0.01
-    memory = contacts.make_memory(2)
-    memory.pairs[:] = [[0, 1], [1, 2]]
-    book = np.zeros((3, reduction.BOOK_WIDTH))
-    book[1:, reduction.STATUS] = RESTING
+    cache = contact_cache.make_contact_cache(2)
+    cache.pairs[:] = [[0, 1], [1, 2]]
+    sleep = np.zeros(3, SLEEP)
+    sleep["status"][1:] = SLEEPING
     velocities, movers, marks = np.zeros((3, 6)), np.zeros(3, np.bool_), np.zeros(3, np.bool_)
     velocities[0, 5] = 0.02 if mover else 0.005
     # The load of rock 1 has changed by 0.1 of the weight, that of rock 2 by 0.2: 0.3 wakes a rock otherwise.
-    memory.values[:, contacts.MEMORY_IMPULSE + 2] = [0.1 * weight, 0.2 * weight]
-    reduction.mark_by_movers(book, velocities, memory, 0, 0.01, movers, marks)
+    cache.points["impulse"][:, 2] = [0.1 * weight, 0.2 * weight]
+    sleeping.mark_by_movers(sleep, velocities, cache, 0, 0.01, movers, marks)
     np.testing.assert_array_equal(movers, [mover, False, False])
     np.testing.assert_array_equal(marks, [False, mover, False])
-    # A point about to touch is no contact yet.
-    apart = contacts.Memory(memory.pairs, np.zeros_like(memory.values))
+    # A speculative point is no contact yet.
+    apart = cache._replace(points=np.zeros_like(cache.points))
     unmarked = np.ones(3, np.bool_)
-    reduction.mark_by_movers(book, velocities, apart, 0, 0.01, movers, unmarked)
+    sleeping.mark_by_movers(sleep, velocities, apart, 0, 0.01, movers, unmarked)
     assert not unmarked.any()
-    nowhere, limits = np.zeros((0, 18)), (0.3 * 9.81 * 0.01, 0.0, 0.1, 1)
-    reduction.wake(book, np.zeros((3, 3)), np.ones(3), mass, memory, 0, nowhere, marks, *limits)
-    np.testing.assert_array_equal(book[:, reduction.STATUS], [AWAKE, AWAKE if mover else RESTING, RESTING])
-    # Long still, they may rest again, but not the one by the mover.
-    book[:, reduction.STATUS], book[:, reduction.STILL_TIME] = AWAKE, 1.0
-    far = np.full(3, 1e3)
-    reduction.rest(
-        book, np.zeros((3, 3)), velocities, np.ones(3), nowhere, marks, 0.01, 1e-3, 0.1, 0.05, -far, far, True
-    )
-    np.testing.assert_array_equal(book[:, reduction.STATUS], [RESTING, AWAKE if mover else RESTING, RESTING])
+    rocks, thresholds = (np.zeros((3, 3)), np.ones(3)), make_thresholds(0.3 * 9.81 * 0.01, 0.0, 0.1)
+    sleeping.wake(*rocks, mass, cache, 0, NOWHERE, marks, thresholds, sleep)
+    np.testing.assert_array_equal(sleep["status"], [AWAKE, AWAKE if mover else SLEEPING, SLEEPING])
+    # Long still, they may fall asleep again, but not the one by the mover.
+    sleep["status"], sleep["still_time"] = AWAKE, 1.0
+    limits = sleeping.SleepLimits(1e-3, 0.1, 0.05)
+    sleeping.fall_asleep(*rocks, NOWHERE, marks, 0.01, limits, sleep, velocities)
+    np.testing.assert_array_equal(sleep["status"], [SLEEPING, AWAKE if mover else SLEEPING, SLEEPING])
 
 
 @pytest.mark.parametrize(
-    ("other", "n_idle", "wakes"), [(LOST, 0, True), (RESTING, 0, False), (LOST, 1, False)]
+    ("other", "n_sleeping", "wakes"), [(LOST, 0, True), (SLEEPING, 0, False), (LOST, 1, False)]
 )
-def test_a_rock_wakes_when_what_carried_it_has_left_the_site(other, n_idle, wakes):
+def test_a_rock_wakes_when_what_carried_it_has_left_the_site(other, n_sleeping, wakes):
     """Rock 0 rests on rock 1. Contacts that were not solved in the last step cannot have changed, and are left out."""
     weight = 100.0 * 9.81 * 0.01
-    memory = contacts.make_memory(1)
-    memory.pairs[0, 1], memory.values[0, contacts.MEMORY_IMPULSE + 2] = 1, -weight
-    book = np.zeros((2, reduction.BOOK_WIDTH))
-    book[:, reduction.STATUS] = RESTING, other
-    book[:, reduction.REFERENCE + 2] = np.float32(weight), -np.float32(weight)
-    nowhere, alone, limits = np.zeros((0, 18)), np.zeros(2, np.bool_), (0.3 * 9.81 * 0.01, 0.3, 0.1, 1)
-    n = reduction.wake(
-        book, np.zeros((2, 3)), np.ones(2), np.full(2, 100.0), memory, n_idle, nowhere, alone, *limits
+    cache = contact_cache.make_contact_cache(1)
+    cache.pairs[0, 1], cache.points["impulse"][0, 2] = 1, -weight
+    sleep = np.zeros(2, SLEEP)
+    sleep["status"] = SLEEPING, other
+    sleep["reference"][:, 2] = np.float32(weight), -np.float32(weight)
+    alone, thresholds = np.zeros(2, np.bool_), make_thresholds(0.3 * 9.81 * 0.01, 0.3, 0.1)
+    n = sleeping.wake(
+        np.zeros((2, 3)), np.ones(2), np.full(2, 100.0), cache, n_sleeping, NOWHERE, alone, thresholds, sleep
     )
     assert n == wakes
 
@@ -855,7 +860,7 @@ def test_all_that_have_moved_are_woken_together_from_time_to_time():
     arrays = engine.make_arrays(pile)
     awake = []
     for _ in range(100):
-        awake.append(arrays.book[:, reduction.STATUS] == AWAKE)
+        awake.append(arrays.status == AWAKE)
         arrays, _ = engine.advance(arrays)
     assert arrays.steps == 100
     first, second = np.transpose(awake)

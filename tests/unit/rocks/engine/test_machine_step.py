@@ -7,17 +7,10 @@ import pytest
 
 from drakerock.rocks.engine.machine_step import (
     JOINT_WIDTH,
+    NO_BODY,
     SITE_WIDTH,
     calc_free_motion,
     make_machine_arrays,
-)
-from drakerock.rocks.engine.solver import (
-    LOWER,
-    NORMAL_ROW,
-    ROW_COMPLIANCE,
-    ROW_MASS,
-    TARGET,
-    UPPER,
 )
 
 N_V, N_BODIES, H = 9, 3, 0.01
@@ -84,7 +77,7 @@ def test_rows_measure_joints_and_points_on_the_site(rng, inertia, jacobian):
     joints = np.array([[4, 1.0, 0.3, 1e-3, -5.0, 6.0], [7, -1.0, -0.2, 0.0, 0.0, np.inf]])
     normal, point = np.array([0.6, 0.0, 0.8]), np.array([0.3, -1.0, 0.2])
     depth, stiffness, mu, tolerance = 2e-3, 5e6, 0.7, 1e-3
-    contact = np.array([[1, *normal, *point, depth, stiffness, mu]])
+    contact = np.array([[1, *normal, *point, depth, stiffness, mu, NO_BODY]])
     arrays = make_machine_arrays(inverse, jacobian, origins, joints, contact, tolerance, H)
 
     measured = arrays.rows @ velocity
@@ -95,15 +88,26 @@ def test_rows_measure_joints_and_points_on_the_site(rng, inertia, jacobian):
     assert np.linalg.norm(measured[2:]) == pytest.approx(np.linalg.norm(v_WP))
 
     values = arrays.row_values
-    assert np.array_equal(values[:2, [TARGET, ROW_COMPLIANCE, LOWER, UPPER]], joints[:, 2:])
-    assert values[2, [TARGET, ROW_COMPLIANCE, LOWER, UPPER]] == pytest.approx(
-        [depth / H, 1.0 / (H * H * stiffness), 0.0, np.inf]
-    )
+    law = ["target", "compliance", "lower", "upper"]
+    assert values[:2][law].tolist() == [tuple(joint) for joint in joints[:, 2:]]
+    assert values[2][law].tolist() == pytest.approx((depth / H, 1.0 / (H * H * stiffness), 0.0, np.inf))
     # Full friction, mu times the load of the penetration, at the stiction tolerance.
-    for row in (3, 4):
-        assert values[row, ROW_COMPLIANCE] * mu * H * stiffness * depth == pytest.approx(tolerance)
-        assert values[row, [LOWER, UPPER, NORMAL_ROW]].tolist() == [-mu, mu, 2]
-    assert values[:3, NORMAL_ROW].tolist() == [-1, -1, -1]
+    for row in values[3:5]:
+        assert row["compliance"] * mu * H * stiffness * depth == pytest.approx(tolerance)
+        assert row[["lower", "upper", "normal_row"]].tolist() == (-mu, mu, 2)
+    assert values["normal_row"][:3].tolist() == [-1, -1, -1]
     assert np.allclose(arrays.row_response, arrays.rows @ inverse)
     diagonal = np.diag(arrays.rows @ inverse @ arrays.rows.T)
-    assert np.allclose(values[:, ROW_MASS] * (diagonal + values[:, ROW_COMPLIANCE]), 1.0)
+    assert np.allclose(values["mass"] * (diagonal + values["compliance"]), 1.0)
+
+
+def test_a_contact_of_two_bodies_measures_one_against_the_other(rng, inertia, jacobian):
+    inverse, origins, velocity = np.linalg.inv(inertia), rng.normal(size=(N_BODIES, 3)), rng.normal(size=N_V)
+    normal, point = np.array([0.6, 0.0, 0.8]), np.array([0.3, -1.0, 0.2])
+    contact = np.array([[1, *normal, *point, 2e-3, 5e6, 0.7, 2]])
+    arrays = make_machine_arrays(inverse, jacobian, origins, np.zeros((0, JOINT_WIDTH)), contact, 1e-3, H)
+    V_WBs = [jacobian[b] @ velocity for b in (1, 2)]
+    speeds = [V[3:] + np.cross(V[:3], point - origins[b]) for V, b in zip(V_WBs, (1, 2), strict=True)]
+    measured = arrays.rows @ velocity
+    assert measured[0] == pytest.approx(normal @ (speeds[0] - speeds[1]))
+    assert np.linalg.norm(measured) == pytest.approx(np.linalg.norm(speeds[0] - speeds[1]))

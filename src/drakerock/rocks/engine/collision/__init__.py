@@ -1,1 +1,1 @@
-"""Collision: from poses to contact points with gaps and normals."""
+"""Collision: from poses to contact points with gaps and normals. `detection` puts its parts in order."""

@@ -11,13 +11,30 @@ shakes the pile.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
-from drakerock.rocks.engine.collision.geometry import get_corner, rotate, rotate_back
+from drakerock.rocks.engine.collision.geometry import Core, get_corner, get_radius, get_rounding
 from drakerock.rocks.engine.collision.shapes import ConvexShapes
-from drakerock.rocks.engine.compiling import Array, Rotation, kernel
+from drakerock.rocks.engine.compiling import Array, Record, Vector, kernel
+from drakerock.rocks.engine.records import CANDIDATE
+from drakerock.rocks.engine.vectors import (
+    add,
+    dot,
+    get_vector,
+    negate,
+    rotate,
+    rotate_back,
+    scale,
+    set_vector,
+    subtract,
+)
 
+# Corners of an outline, and candidates, at most; others are left out.
 MAX_OUTLINE = 96
+# Points of a pair at most: a face rests on four.
 MAX_POINTS = 4
 # A corner is a known point of the last step if this near to it [radius of the smaller body].
 KNOWN_DISTANCE = 0.03
@@ -25,34 +42,52 @@ KNOWN_DISTANCE = 0.03
 KNOWN_DEPTH = 3e-4
 # By how much farther, squared, it has to be from the points chosen already.
 KNOWN_FACTOR = 2.0
-# Columns of a candidate: position, gap, 1 if known.
-KNOWN = 4
-CANDIDATE_WIDTH = 5
+# Points of a pair are at least this far from each other [radius of the smaller body].
+SPREAD = 0.2
+# The nearest point gives way to a corner that is farther apart by less than this [m].
+CORNER_GAP = 1e-3
 
 
-def make_manifold_workspace() -> tuple[Array, Array, Array, Array]:
-    """Return (corners, outline, clipped, candidates), all of MAX_OUTLINE rows."""
-    return (
+class ManifoldWorkspace(NamedTuple):
+    """Scratch memory, all of MAX_OUTLINE rows: a face's corners, what is left of it, what is cut, candidates."""
+
+    corners: NDArray[np.float64]
+    outline: NDArray[np.float64]
+    clipped: NDArray[np.float64]
+    candidates: Array
+
+
+def make_manifold_workspace() -> ManifoldWorkspace:
+    """Return scratch memory for `make_manifold`."""
+    return ManifoldWorkspace(
         np.zeros((MAX_OUTLINE, 3)),
         np.zeros((MAX_OUTLINE, 3)),
         np.zeros((MAX_OUTLINE, 4)),
-        np.zeros((MAX_OUTLINE, CANDIDATE_WIDTH)),
+        np.zeros(MAX_OUTLINE, CANDIDATE),
     )
 
 
-@kernel
-def _calc_cosine(normals: Array, face: int, x: float, y: float, z: float) -> float:
-    return float(normals[face, 0] * x + normals[face, 1] * y + normals[face, 2] * z)
+class _Side(NamedTuple):
+    """One of a pair's bodies: its face in contact, its core, where it is from A's origin, its normal in its frame."""
+
+    face: int
+    core: Core
+    position: Vector
+    normal: Vector
 
 
 @kernel
-def _find_face(shapes: ConvexShapes, shape: int, x: float, y: float, z: float) -> tuple[int, float]:
-    """Return the face of a core whose normal is nearest to (x, y, z), and the cosine between them."""
+def _calc_cosine(shapes: ConvexShapes, face: int, direction: Vector) -> float:
+    return float(dot(get_vector(shapes.face_normals[face]), direction))
+
+
+@kernel
+def _find_face(shapes: ConvexShapes, shape: int, direction: Vector) -> tuple[int, float]:
+    """Return the face of a core whose normal is nearest to a direction, and the cosine between them."""
     best = -2.0
     index = shapes.face_start[shape]
-    normals = shapes.face_normals
     for face in range(shapes.face_start[shape], shapes.face_start[shape + 1]):
-        cosine = _calc_cosine(normals, face, x, y, z)
+        cosine = _calc_cosine(shapes, face, direction)
         if cosine > best:
             best = cosine
             index = face
@@ -60,13 +95,11 @@ def _find_face(shapes: ConvexShapes, shape: int, x: float, y: float, z: float) -
 
 
 @kernel
-def _clip(
-    outline: Array, n_points: int, clipped: Array, nx: float, ny: float, nz: float, offset: float
-) -> int:
+def _clip(n_points: int, normal: Vector, offset: float, outline: Array, clipped: Array) -> int:
     """Cut away the part of an outline outside the plane ``n p = offset``; return the number of its corners."""
     n_outside = 0
     for k in range(n_points):
-        clipped[k, 3] = outline[k, 0] * nx + outline[k, 1] * ny + outline[k, 2] * nz - offset
+        clipped[k, 3] = dot(get_vector(outline[k]), normal) - offset
         n_outside += clipped[k, 3] > 0.0
     if n_outside == 0 or n_outside == n_points:
         return n_points - n_outside
@@ -90,25 +123,51 @@ def _clip(
 
 
 @kernel
-def find_first_point(candidates: Array, n_candidates: int, known: Array, n_known: int, radius: float) -> int:
+def _find_nearest(point: Array, others: Array, n_others: int) -> float:
+    """Return the square of the distance from a point to the nearest of others [m^2]."""
+    nearest2 = np.inf
+    for j in range(n_others):
+        d = subtract(get_vector(point), get_vector(others[j]))
+        nearest2 = min(nearest2, dot(d, d))
+    return nearest2
+
+
+@kernel
+def add_candidate(point: Vector, gap: float, n_candidates: int, candidates: Array) -> int:
+    """Add a corner to the candidates, if there is room; return their number."""
+    if n_candidates < len(candidates):
+        candidate = candidates[n_candidates]
+        set_vector(point, candidate.point)
+        candidate.gap, candidate.known = gap, 0.0
+        n_candidates += 1
+    return n_candidates
+
+
+@kernel
+def set_point(candidate: Record, point: Array) -> None:
+    """Set a manifold's point (4,) to a candidate: position and gap."""
+    set_vector(get_vector(candidate.point), point)
+    point[3] = candidate.gap
+
+
+@kernel
+def find_first_point(n_candidates: int, known: Array, n_known: int, radius: float, candidates: Array) -> int:
     """Mark the known candidates; return the deepest, a known one if it is nearly as deep.
 
-    Args:
-        candidates, n_candidates: corners with gaps; column KNOWN is set.
+    Reads:
+        n_candidates: number of candidates.
         known, n_known: (.., 3) points that carried load in the last step.
         radius: of the smaller body [m].
+    Writes:
+        candidates: (n,) records `CANDIDATE`; whether they are known.
     """
     first = 0
     least = np.inf
     for k in range(n_candidates):
-        nearest2 = np.inf
-        for j in range(n_known):
-            dx = candidates[k, 0] - known[j, 0]
-            dy = candidates[k, 1] - known[j, 1]
-            dz = candidates[k, 2] - known[j, 2]
-            nearest2 = min(nearest2, dx * dx + dy * dy + dz * dz)
-        candidates[k, KNOWN] = 1.0 if nearest2 < (KNOWN_DISTANCE * radius) ** 2 else 0.0
-        gap = candidates[k, 3] - KNOWN_DEPTH * candidates[k, KNOWN]
+        candidate = candidates[k]
+        nearest2 = _find_nearest(candidate.point, known, n_known)
+        candidate.known = 1.0 if nearest2 < (KNOWN_DISTANCE * radius) ** 2 else 0.0
+        gap = candidate.gap - KNOWN_DEPTH * candidate.known
         if gap < least:
             least = gap
             first = k
@@ -117,146 +176,162 @@ def find_first_point(candidates: Array, n_candidates: int, known: Array, n_known
 
 @kernel
 def add_spread_points(
-    candidates: Array, n_candidates: int, points: Array, n_points: int, min_distance: float
+    candidates: Array, n_candidates: int, n_points: int, min_distance: float, points: Array
 ) -> int:
-    """Add to the manifold `points` (m, 4) those candidates that are farthest from the points it has, up to m.
+    """Add those candidates to a manifold that are farthest from the points it has, up to its room.
 
-    Known candidates go before others that are not much farther. Returns the number of points.
+    Known candidates go before others that are not much farther.
+
+    Reads:
+        candidates, n_candidates: records `CANDIDATE`.
+        n_points: number of points so far.
+        min_distance: between points [m].
+    Writes:
+        points: (m, 4) positions and gaps.
+
+    Returns:
+        the number of points.
     """
     while n_points < len(points):
         best = 0.0
         chosen = -1
         for k in range(n_candidates):
-            nearest2 = np.inf
-            for j in range(n_points):
-                dx = candidates[k, 0] - points[j, 0]
-                dy = candidates[k, 1] - points[j, 1]
-                dz = candidates[k, 2] - points[j, 2]
-                nearest2 = min(nearest2, dx * dx + dy * dy + dz * dz)
-            factor = KNOWN_FACTOR if candidates[k, KNOWN] > 0.0 else 1.0
+            nearest2 = _find_nearest(candidates[k].point, points, n_points)
+            factor = KNOWN_FACTOR if candidates[k].known > 0.0 else 1.0
             if nearest2 > min_distance * min_distance / factor and factor * nearest2 > best:
                 best = factor * nearest2
                 chosen = k
         if chosen < 0:
             break
-        for d in range(4):
-            points[n_points, d] = candidates[chosen, d]
+        set_point(candidates[chosen], points[n_points])
         n_points += 1
     return n_points
 
 
 @kernel
+def _add_face_pair(
+    shapes: ConvexShapes,
+    reference: _Side,
+    face: int,
+    n_corners: int,
+    roundings: float,
+    max_gap: float,
+    n_candidates: int,
+    workspace: ManifoldWorkspace,
+) -> int:
+    """Clip the incident face's corners against a face of the reference; add what remains to the candidates.
+
+    All in the reference's frame. Gaps are measured along the pair's normal, to the face's plane.
+    """
+    corners, outline, clipped, candidates = workspace
+    normal = get_vector(shapes.face_normals[face])
+    along = dot(normal, reference.normal)
+    level = reference.core.scale * shapes.face_offsets[face] + roundings * along
+    limit = level + max_gap * along
+    least = np.inf
+    for k in range(n_corners):
+        corner = get_vector(corners[k])
+        set_vector(corner, outline[k])
+        least = min(least, dot(corner, normal))
+    if least >= limit:
+        return n_candidates
+    n_outline = n_corners
+    for k in range(shapes.face_vertex_start[face], shapes.face_vertex_start[face + 1]):
+        side, offset = get_vector(shapes.side_normals[k]), reference.core.scale * shapes.side_offsets[k]
+        n_outline = _clip(n_outline, side, offset, outline, clipped)
+    for k in range(n_outline):
+        corner = get_vector(outline[k])
+        height = dot(corner, normal)
+        if height < limit:
+            n_candidates = add_candidate(corner, (height - level) / along, n_candidates, candidates)
+    return n_candidates
+
+
+@kernel
+def _collect_candidates(
+    shapes: ConvexShapes,
+    reference: _Side,
+    incident: _Side,
+    max_gap: float,
+    min_cosine: float,
+    workspace: ManifoldWorkspace,
+) -> int:
+    """Clip all faces near the incident one against all near the reference's; return the number of candidates."""
+    near, corners = shapes.near_faces, workspace.corners
+    roundings = get_rounding(shapes, reference.core) + get_rounding(shapes, incident.core)
+    n_candidates = 0
+    for j in range(shapes.near_start[incident.face], shapes.near_start[incident.face + 1]):
+        if near[j] != incident.face and _calc_cosine(shapes, near[j], incident.normal) < min_cosine:
+            continue
+        first = shapes.face_vertex_start[near[j]]
+        n_corners = shapes.face_vertex_start[near[j] + 1] - first
+        for k in range(n_corners):
+            corner = get_corner(shapes, shapes.face_vertices[first + k], incident.core)
+            corner = subtract(add(corner, incident.position), reference.position)
+            set_vector(rotate_back(reference.core.rotation, corner), corners[k])
+        for i in range(shapes.near_start[reference.face], shapes.near_start[reference.face + 1]):
+            if near[i] != reference.face and _calc_cosine(shapes, near[i], reference.normal) < min_cosine:
+                continue
+            n_candidates = _add_face_pair(
+                shapes, reference, near[i], n_corners, roundings, max_gap, n_candidates, workspace
+            )
+    return n_candidates
+
+
+@kernel
 def make_manifold(
     shapes: ConvexShapes,
-    shape_a: int,
-    scale_a: float,
-    r_a: Rotation,
-    shape_b: int,
-    scale_b: float,
-    r_b: Rotation,
-    px: float,
-    py: float,
-    pz: float,
-    nx: float,
-    ny: float,
-    nz: float,
+    a: Core,
+    b: Core,
+    p: Vector,
+    normal: Vector,
     max_gap: float,
     min_cosine: float,
     known: Array,
     n_known: int,
     points: Array,
-    workspace: tuple[Array, Array, Array, Array],
+    workspace: ManifoldWorkspace,
 ) -> int:
     """Extend the nearest point of a pair to a manifold of at most as many points as `points` has rows.
 
-    Args:
-        shapes, shape_a, scale_a, r_a, shape_b, scale_b, r_b, px, py, pz: as for `calc_core_distance`.
-        nx, ny, nz: unit normal from A to B.
+    Reads:
+        shapes, a, b, p: as for `calc_core_distance`.
+        normal: unit, from A to B.
         max_gap: points farther apart than this are left out [m].
         min_cosine: a face belongs to the contact if its normal is within this cosine of the pair's.
         known, n_known: (.., 3) points of the last step that carried load, from A's origin.
+    Writes:
         points: (m, 4) positions (half way between the surfaces, from A's origin) and gaps; row 0 holds the
             nearest point on entry, the others are set.
-        workspace: from `make_manifold_workspace`.
+        workspace: scratch.
 
     Returns:
         the number of points, at least 1.
     """
     # The normal in either body's frame, outwards.
-    ax, ay, az = rotate_back(r_a, nx, ny, nz)
-    bx, by, bz = rotate_back(r_b, -nx, -ny, -nz)
-    face_a, cosine_a = _find_face(shapes, shape_a, ax, ay, az)
-    face_b, cosine_b = _find_face(shapes, shape_b, bx, by, bz)
+    normal_a, normal_b = rotate_back(a.rotation, normal), rotate_back(b.rotation, negate(normal))
+    face_a, cosine_a = _find_face(shapes, a.shape, normal_a)
+    face_b, cosine_b = _find_face(shapes, b.shape, normal_b)
     if max(cosine_a, cosine_b) < min_cosine:
         return 1
-    corners, outline, clipped, candidates = workspace
-    roundings = scale_a * shapes.rounding[shape_a] + scale_b * shapes.rounding[shape_b]
-    # Reference and incident body; positions from A's origin.
+    candidates = workspace.candidates
+    side_a, side_b = _Side(face_a, a, (0.0, 0.0, 0.0), normal_a), _Side(face_b, b, p, normal_b)
     if cosine_a >= cosine_b:
-        reference, incident, sign = face_a, face_b, 1.0
-        ref_scale, ref_r, rx, ry, rz, lx, ly, lz = scale_a, r_a, 0.0, 0.0, 0.0, ax, ay, az
-        inc_scale, inc_r, ix, iy, iz, mx, my, mz = scale_b, r_b, px, py, pz, bx, by, bz
-        inc_rounding = scale_b * shapes.rounding[shape_b]
+        reference, incident, sign = side_a, side_b, 1.0
     else:
-        reference, incident, sign = face_b, face_a, -1.0
-        ref_scale, ref_r, rx, ry, rz, lx, ly, lz = scale_b, r_b, px, py, pz, bx, by, bz
-        inc_scale, inc_r, ix, iy, iz, mx, my, mz = scale_a, r_a, 0.0, 0.0, 0.0, ax, ay, az
-        inc_rounding = scale_a * shapes.rounding[shape_a]
-    normals, near, sides = shapes.face_normals, shapes.near_faces, shapes.side_normals
-    n_candidates = 0
-    for j in range(shapes.near_start[incident], shapes.near_start[incident + 1]):
-        if near[j] != incident and _calc_cosine(normals, near[j], mx, my, mz) < min_cosine:
-            continue
-        first = shapes.face_vertex_start[near[j]]
-        n_corners = shapes.face_vertex_start[near[j] + 1] - first
-        for k in range(n_corners):
-            x, y, z = get_corner(shapes.vertices, shapes.face_vertices[first + k], inc_scale, inc_r)
-            corners[k, 0], corners[k, 1], corners[k, 2] = rotate_back(
-                ref_r, x + ix - rx, y + iy - ry, z + iz - rz
-            )
-        for i in range(shapes.near_start[reference], shapes.near_start[reference + 1]):
-            if near[i] != reference and _calc_cosine(normals, near[i], lx, ly, lz) < min_cosine:
-                continue
-            # In the reference's frame. Gaps are measured along the pair's normal, to the reference's plane.
-            fx, fy, fz = normals[near[i], 0], normals[near[i], 1], normals[near[i], 2]
-            along = fx * lx + fy * ly + fz * lz
-            level = ref_scale * shapes.face_offsets[near[i]] + roundings * along
-            limit = level + max_gap * along
-            least = np.inf
-            for k in range(n_corners):
-                x, y, z = corners[k, 0], corners[k, 1], corners[k, 2]
-                outline[k, 0], outline[k, 1], outline[k, 2] = x, y, z
-                least = min(least, x * fx + y * fy + z * fz)
-            if least >= limit:
-                continue
-            n_outline = n_corners
-            for k in range(shapes.face_vertex_start[near[i]], shapes.face_vertex_start[near[i] + 1]):
-                n_outline = _clip(
-                    outline, n_outline, clipped, sides[k, 0], sides[k, 1], sides[k, 2],
-                    ref_scale * shapes.side_offsets[k],
-                )  # fmt: skip
-            for k in range(n_outline):
-                x, y, z = outline[k, 0], outline[k, 1], outline[k, 2]
-                height = x * fx + y * fy + z * fz
-                if height < limit and n_candidates < len(candidates):
-                    candidates[n_candidates, 0] = x
-                    candidates[n_candidates, 1] = y
-                    candidates[n_candidates, 2] = z
-                    candidates[n_candidates, 3] = (height - level) / along
-                    n_candidates += 1
+        reference, incident, sign = side_b, side_a, -1.0
+    n_candidates = _collect_candidates(shapes, reference, incident, max_gap, min_cosine, workspace)
     if n_candidates == 0:
         return 1
+    rounding = get_rounding(shapes, incident.core)
     for k in range(n_candidates):
-        x, y, z = rotate(ref_r, candidates[k, 0], candidates[k, 1], candidates[k, 2])
-        shift = -sign * (inc_rounding + 0.5 * candidates[k, 3])
-        candidates[k, 0] = x + rx + shift * nx
-        candidates[k, 1] = y + ry + shift * ny
-        candidates[k, 2] = z + rz + shift * nz
-    radius = min(scale_a * shapes.radius[shape_a], scale_b * shapes.radius[shape_b])
-    chosen = find_first_point(candidates, n_candidates, known, n_known, radius)
+        point = candidates[k].point
+        place = add(rotate(reference.core.rotation, get_vector(point)), reference.position)
+        shift = -sign * (rounding + 0.5 * candidates[k].gap)
+        set_vector(add(place, scale(shift, normal)), point)
+    radius = min(get_radius(shapes, a), get_radius(shapes, b))
+    chosen = find_first_point(n_candidates, known, n_known, radius, candidates)
     # Where a face or an edge carries, its corners do; the nearest point, which wanders over them, is dropped.
-    if n_candidates >= 2 and candidates[chosen, 3] < points[0, 3] + 1e-3:
-        for d in range(4):
-            points[0, d] = candidates[chosen, d]
-    spread = 0.2 * radius
-    return add_spread_points(candidates, n_candidates, points, 1, spread)
+    if n_candidates >= 2 and candidates[chosen].gap < points[0, 3] + CORNER_GAP:
+        set_point(candidates[chosen], points[0])
+    return add_spread_points(candidates, n_candidates, 1, SPREAD * radius, points)

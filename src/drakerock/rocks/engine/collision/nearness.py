@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from drakerock.rocks.engine.collision.geometry import get_rotation
-from drakerock.rocks.engine.collision.gjk import SEPARATED, Workspace, calc_core_distance
+from drakerock.rocks.engine.collision.geometry import Core
+from drakerock.rocks.engine.collision.gjk import SEPARATED, GjkWorkspace, calc_core_distance
 from drakerock.rocks.engine.collision.shapes import ConvexShapes
 from drakerock.rocks.engine.compiling import Array, kernel
+from drakerock.rocks.engine.vectors import dot, get_rotation, get_vector, subtract
 
 
 @kernel
-def find_near(
+def find_near_pairs(
     shapes: ConvexShapes,
     shape: Array,
     scale: Array,
@@ -17,28 +18,26 @@ def find_near(
     positions: Array,
     pairs: Array,
     gap: float,
-    workspace: Workspace,
     near: Array,
+    workspace: GjkWorkspace,
 ) -> None:
     """Mark the pairs of bodies whose cores overlap or are at most a gap apart.
 
-    Args:
+    Reads:
         shapes: all shapes.
         shape, scale, rotations, positions: of the bodies, (n,), (n,), (n, 3, 3) and (n, 3) in W [m].
         pairs: (m, 2) bodies.
         gap: [m].
+    Writes:
+        near: (m,) True or False.
         workspace: from `make_gjk_workspace`.
-        near: (m,), set to True or False.
     """
     for k in range(len(pairs)):
         a, b = pairs[k, 0], pairs[k, 1]
-        px = positions[b, 0] - positions[a, 0]
-        py = positions[b, 1] - positions[a, 1]
-        pz = positions[b, 2] - positions[a, 2]
+        p = subtract(get_vector(positions[b]), get_vector(positions[a]))
         # At one place any direction is as good as another.
-        gx = px if px * px + py * py + pz * pz > 0.0 else 1.0
-        found = calc_core_distance(
-            shapes, shape[a], scale[a], get_rotation(rotations, a), shape[b], scale[b], get_rotation(rotations, b),
-            px, py, pz, gx, py, pz, 0, gap, workspace,
-        )  # fmt: skip
+        guess = (p[0] if dot(p, p) > 0.0 else 1.0, p[1], p[2])
+        core_a = Core(shape[a], scale[a], get_rotation(rotations, a))
+        core_b = Core(shape[b], scale[b], get_rotation(rotations, b))
+        found = calc_core_distance(shapes, core_a, core_b, p, guess, 0, gap, workspace)
         near[k] = found[0] != SEPARATED

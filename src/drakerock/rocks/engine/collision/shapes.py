@@ -19,8 +19,12 @@ IntArray = NDArray[np.int64]
 
 # Faces within 15 degrees of each other are near.
 NEAR_COSINE = 0.966
-# How far a corner moves inwards at most [roundings].
+# How far a corner moves inwards at most: a needle's tip would run away [roundings].
 MAX_INSET = 4.0
+# Planes that meet in a corner count as parallel below this singular value, as a share of the largest.
+MIN_SINGULAR_VALUE = 1e-3
+# Triangles whose planes differ by less are one face [size of the shape, 1 m at least].
+SAME_PLANE = 1e-6
 
 
 class ConvexShapes(NamedTuple):
@@ -127,8 +131,7 @@ def _make_core(points: Array, rounding: float) -> tuple[Array, list[IntArray], A
     core = corners.copy()
     for k, corner in enumerate(corners):
         planes = normals[[k in face for face in faces]]
-        inset = np.linalg.lstsq(planes, np.full(len(planes), -rounding), rcond=1e-3)[0]
-        # a needle's tip would run away
+        inset = np.linalg.lstsq(planes, np.full(len(planes), -rounding), rcond=MIN_SINGULAR_VALUE)[0]
         core[k] = corner + inset * min(1.0, MAX_INSET * rounding / np.linalg.norm(inset))
     offsets = np.array([normal @ corners[face[0]] for normal, face in zip(normals, faces, strict=True)])
     if not ((normals @ core.mean(axis=0)) < offsets - rounding).all():
@@ -150,7 +153,7 @@ def _find_faces(points: Array) -> tuple[Array, list[IntArray], Array]:
     groups: list[tuple[Array, set[int]]] = []
     for simplex, equation in zip(hull.simplices, hull.equations, strict=True):
         for equation_0, members in groups:
-            if np.abs(equation_0 - equation).max() < 1e-6 * max(1.0, size):
+            if np.abs(equation_0 - equation).max() < SAME_PLANE * max(1.0, size):
                 members.update(index[int(corner)] for corner in simplex)
                 break
         else:

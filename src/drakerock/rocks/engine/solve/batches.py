@@ -1,7 +1,8 @@
-"""Contacts in batches of sixteen that share no rock, and a Gauss-Seidel update of a whole batch at once.
+"""Coloured batches: sixteen contacts that share no rock, and a Gauss-Seidel update of a whole batch at once.
 
 The contacts of a batch have no bearing on each other, so to update them together is to update them one after the
-other. Rows are packed in single precision, field by field, so that a field of a batch lies in line.
+other. It is a greedy colouring of the graph whose nodes are rocks and whose edges are contacts. Rows are packed in
+single precision, field by field, so that a field of a batch lies in line.
 """
 
 from __future__ import annotations
@@ -16,33 +17,31 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from drakerock.rocks.engine.compiling import Array, allocating_kernel, kernel
-from drakerock.rocks.engine.contacts import (
-    ARM_A,
-    ARM_B,
-    BIAS,
-    COMPLIANCE,
-    COUPLING_1,
-    COUPLING_2,
-    FRICTION,
-    IMPULSE,
-    NORMAL,
-    NORMAL_MASS,
-    TANGENT_1,
-    TANGENT_2,
-    TANGENT_MASS,
-    TANGENT_STEP,
-)
-from drakerock.rocks.engine.lanes import INTEGER, LANES, WIDTH, Lanes, gather, make_zeros, scatter
-from drakerock.rocks.engine.solver import BODY_WIDTH
+from drakerock.rocks.engine.memory_access import make_aligned_zeros
+from drakerock.rocks.engine.records import CONTACT_ROW, SINGLE_BODY, as_matrix, count_columns, find_column
+from drakerock.rocks.engine.solve.lanes import INTEGER, LANES, WIDTH, Lanes, gather, scatter
+from drakerock.rocks.engine.solve.rows import ContactRows
 
 # A vector each of the contacts of a batch: three numbers, in all lanes.
 Vectors = tuple[Lanes, ...]
 
-# Fields of a packed row: the first columns as in `contacts`, up to the impulses, then the tangential step.
-FIELD_TANGENT_STEP = IMPULSE + 3
-FIELDS = FIELD_TANGENT_STEP + 1
+# Fields of a packed row: the first columns of a contact row, up to its impulses, then its tangential step.
+NORMAL, TANGENT_1, TANGENT_2 = (
+    find_column(CONTACT_ROW, name) for name in ("normal", "tangent_1", "tangent_2")
+)
+ARM_A, ARM_B = find_column(CONTACT_ROW, "arm_a"), find_column(CONTACT_ROW, "arm_b")
+NORMAL_MASS, TANGENT_MASS = find_column(CONTACT_ROW, "normal_mass"), find_column(CONTACT_ROW, "tangent_mass")
+COUPLING = find_column(CONTACT_ROW, "coupling")
+BIAS, COMPLIANCE = find_column(CONTACT_ROW, "bias"), find_column(CONTACT_ROW, "compliance")
+FRICTION, IMPULSE = find_column(CONTACT_ROW, "friction"), find_column(CONTACT_ROW, "impulse")
+TANGENT_STEP = IMPULSE + 3
+ROW_TANGENT_STEP = find_column(CONTACT_ROW, "tangent_step")
+FIELDS = TANGENT_STEP + 1
 
-# Batches that are being filled at a time: one bit each in a body's mark.
+# Numbers of a body.
+BODY_WIDTH = count_columns(SINGLE_BODY)
+
+# Batches that are being filled at a time: one bit each in a body's mark. More are fuller, and take longer to fill.
 OPEN = 32
 # An empty place in a batch.
 NOBODY = -1
@@ -67,26 +66,45 @@ class BatchArrays(NamedTuple):
 def make_batch_arrays(n_rows: int) -> BatchArrays:
     """Return room for as many rows, if need be each in a batch of its own; what is not used takes no memory."""
     return BatchArrays(
-        make_zeros((n_rows, LANES), np.int32),
-        make_zeros((n_rows, FIELDS, LANES), np.float32),
-        make_zeros((n_rows, 2, LANES), np.int32),
-        make_zeros((LANES,), np.float32),
+        make_aligned_zeros((n_rows, LANES), np.int32),
+        make_aligned_zeros((n_rows, FIELDS, LANES), np.float32),
+        make_aligned_zeros((n_rows, 2, LANES), np.int32),
+        make_aligned_zeros((LANES,), np.float32),
     )
+
+
+class SingleBodies(NamedTuple):
+    """Rocks in single precision (n + 1), see `prepare_rows`; all zero between solves.
+
+    Attributes:
+        values: (n + 1,) records `SINGLE_BODY`.
+        matrix: (n + 1, BODY_WIDTH) the same memory.
+    """
+
+    values: Array
+    matrix: NDArray[np.float32]
+
+
+def make_single_bodies(n_bodies: int) -> SingleBodies:
+    """Return room for so many bodies."""
+    values = make_aligned_zeros((n_bodies,), SINGLE_BODY)
+    return SingleBodies(values, as_matrix(values))
 
 
 @allocating_kernel
 def make_batches(
-    chosen: Array, body_a: Array, body_b: Array, still: int, marks: Array, members: Array, n_batches: int
+    chosen: Array, body_a: Array, body_b: Array, still: int, n_batches: int, members: Array, marks: Array
 ) -> int:
     """Put rows into batches without a common body, each row into the first open batch that has none of its own.
 
-    Args:
+    Reads:
         chosen: (m,) the rows.
         body_a, body_b: per row.
         still: number of the body that stands still, which any number of rows of a batch may touch.
-        marks: (bodies of the solve,) scratch; has to be zero and is left so.
-        members: (capacity, LANES) set from `n_batches` on: rows, NOBODY in places left over.
         n_batches: number of batches before.
+    Writes:
+        members: (capacity, LANES) from `n_batches` on: rows, NOBODY in places left over.
+        marks: (bodies of the solve,) scratch; has to be zero and is left so.
 
     Returns:
         number of batches.
@@ -103,7 +121,7 @@ def make_batches(
         if slot == OPEN:
             # Each has a row of one of these bodies: the fullest makes room.
             slot = int(np.argmax(size))
-            _close(members, place[slot], size[slot], slot, body_a, body_b, marks)
+            _close(body_a, body_b, place[slot], size[slot], slot, members, marks)
             size[slot] = 0
         elif slot == n_open:
             n_open += 1
@@ -116,17 +134,17 @@ def make_batches(
         if b != still:
             marks[b] |= 1 << slot
         if size[slot] == LANES:
-            _close(members, place[slot], LANES, slot, body_a, body_b, marks)
+            _close(body_a, body_b, place[slot], LANES, slot, members, marks)
             size[slot] = 0
     for slot in range(n_open):
         if size[slot] > 0:
-            _close(members, place[slot], size[slot], slot, body_a, body_b, marks)
+            _close(body_a, body_b, place[slot], size[slot], slot, members, marks)
     return n_batches
 
 
 @kernel
 def _close(
-    members: Array, batch: int, size: int, slot: int, body_a: Array, body_b: Array, marks: Array
+    body_a: Array, body_b: Array, batch: int, size: int, slot: int, members: Array, marks: Array
 ) -> None:
     """Take the marks of an open batch from its bodies; places left over are nobody's."""
     for lane in range(size):
@@ -138,41 +156,54 @@ def _close(
 
 
 @kernel
-def pack(rows: Array, body_a: Array, body_b: Array, still: int, batches: BatchArrays, n_batches: int) -> None:
+def pack(rows: ContactRows, still: int, n_batches: int, batches: BatchArrays) -> None:
     """Copy rows to single precision, batch by batch.
 
-    Args:
-        rows, body_a, body_b: contact rows and the bodies of each.
+    Reads:
+        rows: contact rows.
         still: see `make_batches`; places left over are its own.
-        batches, n_batches: with members; fields and bodies are set.
+        n_batches: number of batches.
+    Writes:
+        batches: with members; fields and bodies are set.
     """
-    members, fields, bodies = batches.members, batches.fields, batches.bodies
+    members, bodies = batches.members, batches.bodies
     for n in range(n_batches):
         size = 0
         while size < LANES and members[n, size] != NOBODY:
             k = members[n, size]
-            bodies[n, 0, size], bodies[n, 1, size] = body_a[k], body_b[k]
+            bodies[n, 0, size], bodies[n, 1, size] = rows.body_a[k], rows.body_b[k]
             size += 1
         for lane in range(size, LANES):
             bodies[n, 0, lane], bodies[n, 1, lane] = still, still
-        # Field by field, so that memory is written in line.
-        for d in range(FIELDS):
-            column = d if d < FIELD_TANGENT_STEP else TANGENT_STEP
-            for lane in range(size):
-                fields[n, d, lane] = rows[members[n, lane], column]
-            for lane in range(size, LANES):
-                fields[n, d, lane] = 0.0
+        _pack_fields(rows, n, size, members, batches.fields)
 
 
 @kernel
-def unpack_impulses(batches: BatchArrays, n_batches: int, rows: Array) -> None:
-    """Copy the impulses back to their rows."""
+def _pack_fields(rows: ContactRows, n: int, size: int, members: Array, fields: Array) -> None:
+    """Copy the fields of a batch, one after the other, so that memory is written in line."""
+    for d in range(FIELDS):
+        column = d if d < TANGENT_STEP else ROW_TANGENT_STEP
+        for lane in range(size):
+            fields[n, d, lane] = rows.matrix[members[n, lane], column]
+        for lane in range(size, LANES):
+            fields[n, d, lane] = 0.0
+
+
+@kernel
+def unpack_impulses(batches: BatchArrays, n_batches: int, rows: ContactRows) -> None:
+    """Copy the impulses back to their rows.
+
+    Reads:
+        batches, n_batches: after the iterations.
+    Writes:
+        rows: their impulses.
+    """
     for n in range(n_batches):
         for lane in range(LANES):
             k = batches.members[n, lane]
             if k != NOBODY:
                 for d in range(3):
-                    rows[k, IMPULSE + d] = batches.fields[n, IMPULSE + d, lane]
+                    rows.values[k].impulse[d] = batches.fields[n, IMPULSE + d, lane]
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -181,12 +212,13 @@ def _update_batch(_context: Any, fields: Any, numbers: Any, changes: Any, bodies
 
 
 @kernel
-def solve_batch(batches: BatchArrays, batch: int, bodies: Array) -> None:
-    """Update the contacts of a batch and the velocities of their rocks, see `solver.solve_row`.
+def solve_batch(batch: int, batches: BatchArrays, bodies: Array) -> None:
+    """Update the contacts of a batch and the velocities of their rocks, as `update_impulse` does one by one.
 
-    Args:
-        batches: packed; the batch's impulses are changed, the sizes of the normal changes added to `changes`.
+    Reads:
         batch: which.
+    Writes:
+        batches: packed; the batch's impulses are changed, the sizes of the normal changes added to `changes`.
         bodies: (n, BODY_WIDTH) float32, C-contiguous; velocities are changed.
     """
     _update_batch(batches.fields, batches.bodies, batches.changes, bodies, batch)
@@ -234,7 +266,7 @@ def _build_batch_update(context: Any, builder: Any, signature: Any, arguments: A
         """Return a body's columns."""
         return gather(builder, pointers) + gather(builder, [move(pointer, WIDTH) for pointer in pointers])
 
-    def turn(w: Vectors, inertia: Sequence[Lanes], torque: Vectors) -> Vectors:
+    def push(w: Vectors, inertia: Sequence[Lanes], torque: Vectors) -> Vectors:
         """Return ``w + I^-1 torque``."""
         xx, xy, xz, yy, yz, zz = inertia
         rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
@@ -257,13 +289,13 @@ def _build_batch_update(context: Any, builder: Any, signature: Any, arguments: A
     new = new.where_above(zero, new, zero)
     change = new - old
 
-    # Tangential: at once where it sticks, against the slip where it slides (`solver.solve_row`).
-    slip_1 = _dot(tangent_1, d, read(COUPLING_1) * change)
-    slip_2 = _dot(tangent_2, d, read(COUPLING_2) * change)
+    # Tangential: at once where it sticks, against the slip where it slides (`contact_law`).
+    slip_1 = _dot(tangent_1, d, read(COUPLING) * change)
+    slip_2 = _dot(tangent_2, d, read(COUPLING + 1) * change)
     mass_11, mass_12, mass_22 = read_vector(TANGENT_MASS)
     stuck_1 = old_1 - mass_11.times_plus(slip_1, mass_12 * slip_2)
     stuck_2 = old_2 - mass_12.times_plus(slip_1, mass_22 * slip_2)
-    step = -read(FIELD_TANGENT_STEP)
+    step = -read(TANGENT_STEP)
     slid_1, slid_2 = step.times_plus(slip_1, old_1), step.times_plus(slip_2, old_2)
     limit = read(FRICTION) * new
     limit2 = limit * limit
@@ -279,7 +311,7 @@ def _build_batch_update(context: Any, builder: Any, signature: Any, arguments: A
     change_1, change_2 = new_1 - old_1, new_2 - old_2
     axes = zip(normal, tangent_1, tangent_2, strict=True)
     p = tuple(n.times_plus(change, t.times_plus(change_1, u * change_2)) for n, t, u in axes)
-    w_a, w_b = turn(w_a, inertia_a, _cross(p, arm_a)), turn(w_b, inertia_b, _cross(arm_b, p))
+    w_a, w_b = push(w_a, inertia_a, _cross(p, arm_a)), push(w_b, inertia_b, _cross(arm_b, p))
     v_a = [(-mass_a).times_plus(part, v) for part, v in zip(p, v_a, strict=True)]
     v_b = [mass_b.times_plus(part, v) for part, v in zip(p, v_b, strict=True)]
     scatter(builder, pointers_a, [*w_a, *v_a, *columns_a[6:WIDTH]])

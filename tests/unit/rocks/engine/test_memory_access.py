@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drakerock.rocks.engine.compiling import kernel
-from drakerock.rocks.engine.prefetching import prefetch
+from drakerock.rocks.engine.memory_access import prefetch
 
 
 @kernel

@@ -12,31 +12,17 @@ of which waits for the one before; with two chains side by side the processor ne
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import prod
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
-from numpy.typing import DTypeLike, NDArray
 
 # Numbers per vector of the processor, and per batch.
 WIDTH = 8
 LANES = 16
 
-# A line of the processor's cache [bytes].
-LINE = 64
-
 INTEGER = ir.IntType(64)
 _VECTOR = ir.VectorType(ir.FloatType(), WIDTH)
 _UNALIGNED = 4  # bytes: arrays start at any number
-
-
-def make_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return zeros that begin with a line of the cache; a vector that lies across two takes two loads."""
-    size = prod(shape) * np.dtype(dtype).itemsize
-    room = np.zeros(size + LINE, np.uint8)
-    start = -room.ctypes.data % LINE
-    return room[start : start + size].view(dtype).reshape(shape)
 
 
 class Lanes:
