@@ -56,9 +56,10 @@ from drakerock.identity import RESULTS_REVISION
 from drakerock.loading.config import LoadingConfig
 from drakerock.loading.cycle import run_cycle
 from drakerock.loading.scenario import Scenario
-from drakerock.rocks.config import PileConfig, PileRecipe, SiteConfig
+from drakerock.rocks.config import PileConfig, SiteConfig
 from drakerock.rocks.drake.system import NonsmoothRocks
 from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
+from drakerock.rocks.making.recipe import PileRecipe
 from drakerock.rocks.making.settling import make_pile
 from drakerock.rocks.state import PileState
 

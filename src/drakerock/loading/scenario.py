@@ -12,8 +12,9 @@ from drakerock.config import Config, load_config
 from drakerock.lhd.config import MachineConfig
 from drakerock.loading.config import LoadingConfig
 from drakerock.resources import find_data
-from drakerock.rocks.config import PileConfig, PileRecipe, RocksConfig, SiteConfig
+from drakerock.rocks.config import PileConfig, RocksConfig, SiteConfig
 from drakerock.rocks.engine.config import DynamicsConfig
+from drakerock.rocks.making.recipe import PileRecipe
 
 
 class RecordingConfig(Config):

@@ -8,7 +8,6 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from drakerock.config import Config
-from drakerock.rocks.engine.config import DynamicsConfig
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -150,13 +149,3 @@ class PileConfig(Config):
         """Upper side of the emitter [m]; between two batches it empties by their fall."""
         interval = self.emission_interval
         return self.emission_height + (START_SPEED * interval + 0.5 * GRAVITY * interval**2)
-
-
-class PileRecipe(Config):
-    """All that a made pile depends on; its hash names the pile in the cache."""
-
-    seed: int
-    site: SiteConfig
-    rocks: RocksConfig
-    pile: PileConfig
-    dynamics: DynamicsConfig

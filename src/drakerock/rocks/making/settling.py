@@ -19,7 +19,7 @@ from drakerock.errors import InputError, SimulationFailure
 from drakerock.identity import calc_config_hash, get_versions
 from drakerock.randomness import make_generator
 from drakerock.resources import find_data
-from drakerock.rocks.config import MAX_ROCKS, PileRecipe
+from drakerock.rocks.config import MAX_ROCKS
 from drakerock.rocks.contact_graph import find_loose
 from drakerock.rocks.drake.add_rocks import AddRocks
 from drakerock.rocks.drake.drift import AddDrift
@@ -35,6 +35,7 @@ from drakerock.rocks.making.emission import (
     place_rocks,
     sample_rocks,
 )
+from drakerock.rocks.making.recipe import PileRecipe
 from drakerock.rocks.ordering import order_by_place
 from drakerock.rocks.shapes import RockShape, load_rock_shapes
 from drakerock.rocks.site import Site, make_confined_site, make_site, make_surroundings
