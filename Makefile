@@ -11,7 +11,7 @@ READY = $(VENV)/.ready
 export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
-.PHONY: help demo smoke test test-slow lint bench clean
+.PHONY: help demo smoke test test-slow lint bench bench-compare clean
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
@@ -44,6 +44,10 @@ bench: $(READY) ## the benchmarks
 	$(RUN)/python benchmarks/exploration.py speed
 	$(RUN)/python benchmarks/pile.py all
 	$(RUN)/python benchmarks/rocks.py all
+
+REV ?= HEAD
+bench-compare: $(READY) ## CPU time against a git revision, REV=main; kept in benchmarks/history.jsonl
+	$(RUN)/python benchmarks/compare_revisions.py $(REV)
 
 clean: ## remove the environment and the results
 	rm -rf $(VENV) out
