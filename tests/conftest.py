@@ -19,7 +19,7 @@ from drakerock.lhd.model import add_machine
 from drakerock.loading.planning import DiggingMachine
 from drakerock.loading.scenario import Scenario
 from drakerock.rocks.config import RocksConfig
-from drakerock.rocks.drake.assembly import add_plant
+from drakerock.rocks.drake.plant import add_plant
 from drakerock.rocks.engine.config import DynamicsConfig
 from drakerock.rocks.shapes import RockShape, load_rock_shapes
 from drakerock.rocks.state import PileState

@@ -61,6 +61,9 @@ def AddRockBodies(
 ) -> RockBodies:
     """Add one body per rock to `plant` (before Finalize); all fixed rocks are on one that is welded to the world.
 
+    The plant's output ports are no longer sampled then (`SetUseSampledOutputPorts`): what the rocks' ports say of the
+    coming step is not in them otherwise.
+
     On the world's own body hundreds of them beside the floor, a half-space whose box has no bounds, make Drake read
     stray memory (1.58: a segmentation fault when they are registered).
 
@@ -82,6 +85,7 @@ def AddRockBodies(
         raise InputError("AddRockBodies: the plant is finalized; add rocks as bodies before Finalize()")
     rocks, config = rocks or RocksConfig(), config or PlantEngineConfig()
     shapes = shapes or load_rock_shapes(rocks.shapes)
+    plant.SetUseSampledOutputPorts(False)
     instance = plant.AddModelInstance("rocks")
     kinds = {
         (shape, size): _make_kind(shapes[shape], size, rocks, config, reference_overlap)

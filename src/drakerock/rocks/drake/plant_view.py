@@ -36,6 +36,7 @@ from drakerock.rocks.engine.machine_step import (
     calc_free_motion,
     make_machine_arrays,
 )
+from drakerock.rocks.materials import calc_pair_friction
 
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
@@ -79,9 +80,9 @@ class PlantView(LeafSystem):
     Input ports:
         ``state``: the plant's whole state.
         ``geometry_query``: for the plant's own contacts.
-        ``actuation``, ``MODEL_actuation``, ``MODEL_desired_state``, ``applied_generalized_force``,
-            ``applied_spatial_force``: what the plant's ports of these names get; those that are not connected there
-            need not be here.
+        ``actuation``, ``MODEL_actuation``, ``MODEL_desired_state``, ``applied_generalized_force``: what the plant's
+            ports of these names get; those that are not connected there need not be here.
+        ``applied_spatial_force``: what others than rocks apply.
 
     Output port ``plant_step``: a `MachineStep`.
     """
@@ -289,7 +290,7 @@ class PlantView(LeafSystem):
                     *(0.5 * (a + b) for a, b in sides),
                     pair.depth,
                     of_A.stiffness * of_B.stiffness / (of_A.stiffness + of_B.stiffness),
-                    2.0 * of_A.friction * of_B.friction / (of_A.friction + of_B.friction),
+                    calc_pair_friction(of_A.friction, of_B.friction),
                     NO_BODY if other is None else other,
                 ]
             )

@@ -66,6 +66,7 @@ class NonsmoothRocks(RockSystem):
             open.
 
     Output ports: those of `RockSystem`, and
+        ``spatial_force_of_others``: the input ``applied_spatial_force``, empty where it is left open.
         ``applied_spatial_force``: list of ExternallyAppliedSpatialForce for the plant: the rocks' forces on its bodies
             over the coming step, then those of others.
         ``status``: (n,) 0 awake, 1 resting, 2 fixed, 3 lost.
@@ -115,6 +116,12 @@ class NonsmoothRocks(RockSystem):
         self.DeclareVectorOutputPort("status", n, self._calc_status, {state})
         self.DeclareAbstractOutputPort(
             "contacts", lambda: Value[object](make_empty_contacts()), self._calc_contacts, {step.ticket()}
+        )
+        self.DeclareAbstractOutputPort(
+            "spatial_force_of_others",
+            lambda: Value[list[ExternallyAppliedSpatialForce]]([]),
+            lambda context, output: output.set_value(self._read_others(context)),
+            {self._others.ticket()},
         )
         self.DeclareAbstractOutputPort(
             "applied_spatial_force",
@@ -273,6 +280,9 @@ class NonsmoothRocks(RockSystem):
     def _calc_contacts(self, context: Context, output: Value) -> None:
         output.set_value(self._find_contacts(context))
 
+    def _read_others(self, context: Context) -> list[ExternallyAppliedSpatialForce]:
+        return self._others.Eval(context) if self._others.HasValue(context) else []
+
     def _calc_applied_force(self, context: Context, output: Value) -> None:
         _, report = self._solve(context)
         forces = []
@@ -283,9 +293,7 @@ class NonsmoothRocks(RockSystem):
                 force.p_BoBq_B = np.zeros(3)
                 force.F_Bq_W = SpatialForce(F_B_W[:3], F_B_W[3:])
                 forces.append(force)
-        if self._others.HasValue(context):
-            forces += self._others.Eval(context)
-        output.set_value(forces)
+        output.set_value(forces + self._read_others(context))
 
 
 _N_LOST = list(ROCK_SUMMARY).index("n_lost")
