@@ -8,34 +8,30 @@ from show import add_box, simulate
 from drakerock import AddRocks, RocksConfig, scatter_rocks
 from drakerock.resources import find_data
 
-# Time [s], boom, stick and bucket angles [deg].
-MOTION = [
-    [0, 79, -97, -72], [2.5, 79, -97, -72], [4.5, 32, -42, -85], [5.5, 22, -50, -77], [7.5, 28, -80, -78],
+MOTION = np.array([  # time [s], boom, stick and bucket angles [deg]
+    [0.0, 79, -97, -72], [2.5, 79, -97, -72], [4.5, 32, -42, -85], [5.5, 22, -50, -77], [7.5, 28, -80, -78],
     [9, 32, -93, -124], [11, 50, -86, -154], [12, 50, -86, -154],
-]  # fmt: skip
+])  # fmt: skip
 
 
 def main(out: str = ""):
     plant, scene_graph = drake.AddMultibodyPlantSceneGraph(builder := drake.DiagramBuilder(), time_step=0.01)
-    parser = drake.Parser(plant)
-    parser.package_map().AddPackageXml(str(find_data("models", "package.xml")))
-    (excavator,) = parser.AddModels(url="package://drakerock/excavator/excavator.sdf")
+    (excavator,) = drake.Parser(plant).AddModels(str(find_data("models", "excavator", "excavator.sdf")))
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("house"))
     for size, p in (([12, 6, 1], [2, 0, -0.5]), ([0.4, 2.4, 1.2], [2.4, 0, 0.6]), ([0.4, 2.4, 1.2], [5.4, 0, 0.6]),
                     ([2.6, 0.4, 1.2], [3.9, 1, 0.6]), ([2.6, 0.4, 1.2], [3.9, -1, 0.6])):  # fmt: skip
         add_box(plant, plant.world_body(), size, p)
     plant.Finalize()
-    times, angles = np.split(np.array(MOTION, float), [1], axis=1)
-    path = drake.PiecewisePolynomial.CubicShapePreserving(times.ravel(), np.radians(angles.T), True)
+    path = drake.PiecewisePolynomial.CubicShapePreserving(MOTION[:, 0], np.radians(MOTION[:, 1:].T), True)
     motion = builder.AddSystem(drake.TrajectorySource(path, output_derivative_order=1))
     builder.Connect(motion.get_output_port(), plant.get_desired_state_input_port(excavator))
     plant.SetDefaultPositions(excavator, path.value(0.0))
     config = RocksConfig(gradation=({"size_m": 0.2, "mass_fraction": 0.5}, {"size_m": 0.3, "mass_fraction": 0.5}))
     rocks = AddRocks(builder, plant, scene_graph, scatter_rocks(300, [2.7, -0.75, 0], [5.1, 0.75, 8], config), config)
-    bucket = plant.GetBodyByName("bucket").index()
-    log = drake.LogVectorOutput(rocks.get_body_force_output_port(bucket), builder, 0.01)
-    root = simulate(builder, 12.0, out).get_context()
-    load = -log.FindLog(root).data()[5, -50:].mean() / 9.81
+    force = rocks.get_body_force_output_port(plant.GetBodyByName("bucket").index())
+    log = drake.LogVectorOutput(force, builder, 0.01)
+    data = log.FindLog(simulate(builder, 12.0, out).get_context()).data()
+    load = -data[5, -50:].mean() / 9.81
     print(f"{load:.0f} kg in the bucket")
     return load
 

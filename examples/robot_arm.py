@@ -6,8 +6,7 @@ import typer
 from models.arm import reach
 from show import add_box, simulate
 
-from drakerock import AddRocks, RocksConfig, scatter_rocks
-from drakerock.rocks.drake.scene import FIRST_ROCK_LABEL
+from drakerock import FIRST_ROCK_LABEL, AddRocks, RocksConfig, scatter_rocks
 
 
 def main(out: str = ""):

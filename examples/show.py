@@ -6,10 +6,16 @@ from pathlib import Path
 import pydrake.all as drake
 
 
-def add_box(plant: drake.MultibodyPlant, body: drake.RigidBody, size: Sequence[float], p: Sequence[float]) -> None:
+def add_box(
+    plant: drake.MultibodyPlant,
+    body: drake.RigidBody,
+    size: Sequence[float],
+    p: Sequence[float],
+    friction: float = 1.0,
+) -> None:
     """Give a body a box of `size` with its centre at `p` [m], to touch and to see."""
     X_BG, shape, name = drake.RigidTransform(p), drake.Box(*size), f"box_{p}"
-    plant.RegisterCollisionGeometry(body, X_BG, shape, name, drake.CoulombFriction(1.0, 1.0))
+    plant.RegisterCollisionGeometry(body, X_BG, shape, name, drake.CoulombFriction(friction, friction))
     plant.RegisterVisualGeometry(body, X_BG, shape, name, [0.4, 0.5, 0.4, 1.0])
 
 

@@ -27,6 +27,7 @@ _LAZY: dict[str, str] = {
     "AddRockBodies": "drakerock.rocks.drake.plant_engine",
     "AddRocks": "drakerock.rocks.drake.add_rocks",
     "DigPlanner": "drakerock.loading.planning",
+    "FIRST_ROCK_LABEL": "drakerock.rocks.drake.scene",
     "FeedforwardController": "drakerock.loading.control",
     "NonsmoothConfig": "drakerock.rocks.engine.config",
     "PileSensor": "drakerock.loading.sensing",

@@ -27,6 +27,7 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlan
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, ModelInstanceIndex, MultibodyForces
 from pydrake.systems.framework import Context, InputPort, LeafSystem, ValueProducer
 
+from drakerock.errors import SimulationFailure
 from drakerock.rocks.drake.geometry import Material, read_material
 from drakerock.rocks.engine.engine import MachineStep, make_machineless_step
 from drakerock.rocks.engine.machine_step import (
@@ -162,7 +163,11 @@ class PlantView(LeafSystem):
         plant = self._plant
         h = plant.time_step()
         scratch = self._scratch.Eval(context)
-        plant.SetPositionsAndVelocities(scratch, self._state.Eval(context))
+        state = self._state.Eval(context)
+        if not np.isfinite(state).all():
+            # Drake's proximity engine does not survive such poses.
+            raise SimulationFailure(f"{self._find_lost_body(state)}: its position or velocity is not finite")
+        plant.SetPositionsAndVelocities(scratch, state)
         v, positions = plant.GetVelocities(scratch), plant.GetPositions(scratch)
         generalised, joints = self._calc_own_forces(context, scratch, positions, h)
         inverse, free_change = calc_free_motion(
@@ -198,6 +203,16 @@ class PlantView(LeafSystem):
             for number, corners in self._wake_boxes
         ]
         output.set_value(MachineStep(X_WBs, v, free_change, arrays, np.array(boxes, float).reshape(-1, 18)))
+
+    def _find_lost_body(self, state: Array) -> str:
+        n_q = self._plant.num_positions()
+        for index in self._plant.GetJointIndices():
+            joint = self._plant.get_joint(index)
+            q = state[joint.position_start() :][: joint.num_positions()]
+            v = state[n_q + joint.velocity_start() :][: joint.num_velocities()]
+            if not (np.isfinite(q).all() and np.isfinite(v).all()):
+                return f"body '{joint.child_body().scoped_name()}'"
+        return "the plant"
 
     def _calc_own_forces(
         self, context: Context, scratch: Context, positions: Array, h: float

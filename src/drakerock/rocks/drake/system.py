@@ -21,7 +21,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from drakerock.errors import InputError
+from drakerock.errors import InputError, SimulationFailure
 from drakerock.rocks.drake.geometry import PlantGeometry
 from drakerock.rocks.drake.interface import ROCK_SUMMARY, RockContacts, RockSystem, make_empty_contacts
 from drakerock.rocks.engine import contacts, reduction
@@ -37,8 +37,9 @@ from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
 
-# A body of the plant that starts so deep in a rock starts inside the pile [m].
+# A body of the plant that starts so deep in a rock starts inside the pile: [m], and as a share of the rock's size.
 START_PENETRATION = 0.05
+START_SHARE = 1 / 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +131,16 @@ class NonsmoothRocks(RockSystem):
             {step.ticket(), self._others.ticket()},
         )
         self.DeclareInitializationPublishEvent(self._check_start)
-        self.DeclarePeriodicDiscreteUpdateEvent(engine.time_step, 0.0, self._update)
+        # Together with the plant's own update, from the same state: Drake does unrestricted updates first, and a plant
+        # whose output ports are sampled has one.
+        if plant.has_sampled_output_ports():
+            self.DeclarePeriodicUnrestrictedUpdateEvent(
+                engine.time_step,
+                0.0,
+                lambda context, state: self._update(context, state.get_mutable_discrete_state()),
+            )
+        else:
+            self.DeclarePeriodicDiscreteUpdateEvent(engine.time_step, 0.0, self._update)
 
     @property
     def engine(self) -> NonsmoothEngine:
@@ -228,16 +238,19 @@ class NonsmoothRocks(RockSystem):
         state["report"][:] = np.concatenate([summary, report.F_Bs_W.reshape(-1)])
 
     def _check_start(self, context: Context) -> EventStatus:
-        found = self._find_contacts(context)
-        moving = found.body > 0
-        if moving.any():
-            k = int(np.argmax(np.where(moving, found.depth, -np.inf)))
-            if found.depth[k] > START_PENETRATION:
-                body = self._plant.get_body(BodyIndex(int(found.body[k])))
-                raise InputError(
-                    f"body '{body.scoped_name()}' starts {found.depth[k]:.2f} m inside a rock at "
-                    f"{np.round(found.p_WCs[k], 2).tolist()}: place it outside the pile before the simulation starts"
-                )
+        try:
+            found = self._find_contacts(context)
+        except SimulationFailure as error:
+            raise InputError(f"at the start, {error}") from error
+        allowed = np.minimum(START_PENETRATION, START_SHARE * self._default_pile.size[found.rock])
+        excess = np.where(found.body > 0, found.depth - allowed, -np.inf)
+        if len(found) and excess.max() > 0.0:
+            k = int(np.argmax(excess))
+            body = self._plant.get_body(BodyIndex(int(found.body[k])))
+            raise InputError(
+                f"body '{body.scoped_name()}' starts {found.depth[k]:.2f} m inside a rock at "
+                f"{np.round(found.p_WCs[k], 2).tolist()}: place it outside the pile before the simulation starts"
+            )
         return EventStatus.Succeeded()
 
     def _find_contacts(self, context: Context) -> RockContacts:
