@@ -9,7 +9,7 @@ from drakerock import AddRocks, RocksConfig, scatter_rocks
 from drakerock.resources import find_data
 
 MOTION = np.array([  # time [s], boom, stick and bucket angles [deg]
-    [0.0, 79, -97, -72], [2.5, 79, -97, -72], [4.5, 32, -42, -85], [5.5, 22, -50, -77], [7.5, 28, -80, -78],
+    [0.0, 93, -116, -67], [2.5, 93, -116, -67], [4.5, 32, -42, -85], [5.5, 22, -50, -77], [7.5, 28, -80, -78],
     [9, 32, -93, -124], [11, 50, -86, -154], [12, 50, -86, -154],
 ])  # fmt: skip
 

@@ -18,13 +18,13 @@ class SpeedController(drake.LeafSystem):
 
 def main(out: str = ""):
     plant, scene_graph = drake.AddMultibodyPlantSceneGraph(builder := drake.DiagramBuilder(), time_step=0.01)
-    plough = plant.AddRigidBody("plough", drake.SpatialInertia.SolidBoxWithMass(800.0, 0.3, 2.0, 0.8))
+    plough = plant.AddRigidBody("plough", drake.SpatialInertia.SolidBoxWithMass(3000.0, 0.3, 2.0, 0.8))
     add_box(plant, plant.world_body(), size=[20.0, 9.0, 1.0], p=[0.0, 0.0, -0.5])
     add_box(plant, plough, size=[0.3, 2.0, 0.8], p=[0.0, 0.0, 0.45], friction=0.3)
     rail = plant.AddJoint(drake.PrismaticJoint("rail", plant.world_frame(), plough.body_frame(), [1, 0, 0]))
     plant.AddJointActuator("motor", rail)
     plant.Finalize()
-    controller = builder.AddSystem(SpeedController(speed=0.5, gain=1e6))
+    controller = builder.AddSystem(SpeedController(speed=0.5, gain=2e5))
     builder.Connect(plant.get_state_output_port(), controller.get_input_port())
     builder.Connect(controller.get_output_port(), plant.get_actuation_input_port())
     rocks = AddRocks(builder, plant, scene_graph, scatter_rocks(40, [0.5, -1, 0], [2.5, 1, 6]))

@@ -15,7 +15,10 @@ def add_box(
 ) -> None:
     """Give a body a box of `size` with its centre at `p` [m], to touch and to see."""
     X_BG, shape, name = drake.RigidTransform(p), drake.Box(*size), f"box_{p}"
-    plant.RegisterCollisionGeometry(body, X_BG, shape, name, drake.CoulombFriction(friction, friction))
+    surface = drake.ProximityProperties()
+    # With Drake's default dissipation [s/m] bodies sink into each other.
+    drake.AddContactMaterial(1.0, 1e8, drake.CoulombFriction(friction, friction), surface)
+    plant.RegisterCollisionGeometry(body, X_BG, shape, name, surface)
     plant.RegisterVisualGeometry(body, X_BG, shape, name, [0.4, 0.5, 0.4, 1.0])
 
 

@@ -37,6 +37,7 @@ from drakerock.rocks.engine.machine_step import (
     calc_free_motion,
     make_machine_arrays,
 )
+from drakerock.rocks.engine.motion import HUGE
 from drakerock.rocks.materials import calc_pair_friction
 
 Array = NDArray[np.float64]
@@ -44,6 +45,8 @@ _log = logging.getLogger(__name__)
 
 # Within this distance of its stop a joint has a row for it [rad, m].
 STOP_MARGIN = 0.05
+# Friction below this is as good as none; the laws divide by it.
+SMOOTH = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +167,8 @@ class PlantView(LeafSystem):
         h = plant.time_step()
         scratch = self._scratch.Eval(context)
         state = self._state.Eval(context)
-        if not np.isfinite(state).all():
-            # Drake's proximity engine does not survive such poses.
+        if not (np.abs(state) < HUGE).all():
+            # Neither Drake's proximity engine nor the search for rocks survives such poses.
             raise SimulationFailure(f"{self._find_lost_body(state)}: its position or velocity is not finite")
         plant.SetPositionsAndVelocities(scratch, state)
         v, positions = plant.GetVelocities(scratch), plant.GetPositions(scratch)
@@ -210,7 +213,7 @@ class PlantView(LeafSystem):
             joint = self._plant.get_joint(index)
             q = state[joint.position_start() :][: joint.num_positions()]
             v = state[n_q + joint.velocity_start() :][: joint.num_velocities()]
-            if not (np.isfinite(q).all() and np.isfinite(v).all()):
+            if not ((np.abs(q) < HUGE).all() and (np.abs(v) < HUGE).all()):
                 return f"body '{joint.child_body().scoped_name()}'"
         return "the plant"
 
@@ -292,7 +295,7 @@ class PlantView(LeafSystem):
         for pair in query.ComputePointPairPenetration():
             body_A, of_A = self._find_material(query, pair.id_A)
             body_B, of_B = self._find_material(query, pair.id_B)
-            if body_A is None and body_B is None:
+            if (body_A is None and body_B is None) or not pair.depth > 0.0:
                 continue
             # nhat_BA_W points out of B into A
             number, other, sign = (body_A, body_B, 1.0) if body_A is not None else (body_B, None, -1.0)
@@ -305,7 +308,7 @@ class PlantView(LeafSystem):
                     *(0.5 * (a + b) for a, b in sides),
                     pair.depth,
                     of_A.stiffness * of_B.stiffness / (of_A.stiffness + of_B.stiffness),
-                    calc_pair_friction(of_A.friction, of_B.friction),
+                    max(calc_pair_friction(of_A.friction, of_B.friction), SMOOTH),
                     NO_BODY if other is None else other,
                 ]
             )

@@ -161,10 +161,8 @@ def _set_site_rows(
     values[first, ROW_COMPLIANCE] = 1.0 / (time_step * time_step * stiffness)
     values[first, UPPER] = np.inf
     for k in range(first + 1, first + 3):
-        # Drake's regularised friction is full at the stiction tolerance. Where there is none, its bounds are zero.
-        full = mu * time_step * stiffness * depth
-        if full > 0.0:
-            values[k, ROW_COMPLIANCE] = stiction_tolerance / full
+        # Drake's regularised friction is full at the stiction tolerance.
+        values[k, ROW_COMPLIANCE] = stiction_tolerance / (mu * time_step * stiffness * depth)
         values[k, LOWER], values[k, UPPER] = -mu, mu
         values[k, NORMAL_ROW] = first
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from pydrake.common.value import Value
-from pydrake.geometry import Box, HalfSpace, MeshcatParams, Meshcat, Mesh, SceneGraph, Sphere
+from pydrake.geometry import AddContactMaterial, ProximityProperties, Box, HalfSpace, MeshcatParams, Meshcat, Mesh, SceneGraph, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import (
@@ -20,17 +20,31 @@ from pydrake.multibody.plant import (
 from pydrake.multibody.tree import PdControllerGains, PrismaticJoint, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
+from pydrake.systems.primitives import Adder, ConstantValueSource, ConstantVectorSource, MatrixGain
 
 from drakerock import AddDrift, AddRockBodies, AddRocks, RockContactVisualizer, RocksConfig
-from drakerock.errors import InputError
+from drakerock.errors import InputError, SimulationFailure
 from drakerock.rocks.config import SiteConfig
 from drakerock.rocks.drake.geometry import read_plant_geometry
 from drakerock.rocks.site import calc_bounds, make_site, make_surroundings
 from drakerock.rocks.state import PileState
 from rock_helpers import make_pile
 
-ROUGH = CoulombFriction(1.0, 1.0)
+
+
+def make_material(friction: float) -> ProximityProperties:
+    """With Drake's default dissipation bodies sink into each other."""
+    properties = ProximityProperties()
+    AddContactMaterial(
+        dissipation=1.0,
+        point_stiffness=1e8,
+        friction=CoulombFriction(friction, friction),
+        properties=properties,
+    )
+    return properties
+
+
+ROUGH = make_material(1.0)
 
 
 class World:
@@ -49,7 +63,8 @@ class World:
         """A body with one shape, free, or on a prismatic joint with a motor along `rail`."""
         inertia = SpatialInertia.SolidBoxWithMass(mass, 0.5, 0.5, 0.5) if mass else SpatialInertia.Zero()
         body = self.plant.AddRigidBody(name, inertia)
-        self.add_geometry(name, shape, [0.0, 0.0, 0.0], body, friction)
+        # On a rail it hovers over the floor.
+        self.add_geometry(name, shape, [0.0, 0.0, 0.0 if rail is None or rail[2] else 0.27], body, friction)
         if rail is not None:
             joint = self.plant.AddJoint(
                 PrismaticJoint(f"{name}_rail", self.plant.world_frame(), body.body_frame(), rail)
@@ -233,19 +248,23 @@ def test_rock_rests_on_a_table_of_another_model():
 
 
 def test_two_robots_push_from_both_sides():
-    """A block on either side, each on its rail with 3 kN: the rock between them stays, and carries 3 kN."""
+    """Blocks on rails on either side, one with 3 kN, one that holds its place: the rock between carries 3 kN."""
     world = World()
     shape = Box(0.2, 1.0, 0.5)
     left = world.add_body("left", shape, rail=[1.0, 0.0, 0.0])
-    right = world.add_body("right", shape, rail=[1.0, 0.0, 0.0])
+    right = world.add_body("right", shape, rail=[1.0, 0.0, 0.0], gains=(1e8, 1e7))
     for body, x in ((left, -0.8), (right, 0.8)):
         world.plant.GetJointByName(f"{body.name()}_rail").set_default_translation(x)
     finalized(world)
-    force = world.builder.AddSystem(ConstantVectorSource([3e3, -3e3]))
+    force = world.builder.AddSystem(ConstantVectorSource([3e3, 0.0]))
     world.builder.Connect(force.get_output_port(), world.plant.get_actuation_input_port())
+    place = world.builder.AddSystem(ConstantVectorSource([0.0, 0.8, 0.0, 0.0]))
+    world.builder.Connect(
+        place.get_output_port(), world.plant.get_desired_state_input_port(left.model_instance())
+    )
     rocks = world.add_rocks([[0.0, 0.0, 0.25]])
     end = world.run(2.0)
-    assert abs(end.p_WRs[0, 0]) < 0.3
+    assert 0.2 < end.p_WRs[0, 0] < 0.6
     assert np.linalg.norm(end.V_WRs[0, 3:]) < 0.02
     context = rocks.GetMyContextFromRoot(world.root)
     for body, sign in ((left, -1.0), (right, 1.0)):
@@ -299,11 +318,12 @@ def test_applied_force_of_others_still_acts_and_rocks_feel_it(late):
 def test_bodies_that_touch_each_other_carry_a_rock_together(friction):
     """A block on a block, a rock on top: contacts between two moving bodies are in the solve, smooth ones too."""
     world = World()
-    smooth = CoulombFriction(friction, friction)
-    lower = world.add_body("lower", Box(1.0, 1.0, 0.5), mass=800.0, friction=smooth)
-    upper = world.add_body("upper", Box(1.0, 1.0, 0.5), mass=300.0, friction=smooth)
-    world.place(lower, [0.0, 0.0, 0.25])
-    world.place(upper, [0.0, 0.0, 0.75])
+    smooth = make_material(friction)
+    up = [0.0, 0.0, 1.0]
+    lower = world.add_body("lower", Box(1.0, 1.0, 0.5), mass=800.0, rail=up, friction=smooth)
+    upper = world.add_body("upper", Box(1.0, 1.0, 0.5), mass=300.0, rail=up, friction=smooth)
+    for body, z in ((lower, 0.25), (upper, 0.75)):
+        world.plant.GetJointByName(f"{body.name()}_rail").set_default_translation(z)
     finalized(world)
     rocks = world.add_rocks([[0.0, 0.0, 1.25]])
     end = world.run(1.0)
@@ -341,6 +361,24 @@ def test_contact_forces_are_drawn():
     world.run(0.5)
     assert meshcat.HasPath("/drake/rock_contacts/bodies")
     assert meshcat.HasPath("/drake/rock_contacts/rocks")
+
+
+def test_controller_that_is_unstable_ends_in_a_failure_that_names_the_body():
+    """Velocities that grow without bound reach the search for rocks, which once read memory that is not its own."""
+    world = World()
+    world.add_body("plough", Box(0.2, 1.0, 0.5), rail=[1.0, 0.0, 0.0])
+    world.plant.GetJointByName("plough_rail").set_default_translation(-2.0)
+    finalized(world)
+    gain = world.builder.AddSystem(MatrixGain([[0.0, -1e6]]))
+    offset = world.builder.AddSystem(Adder(2, 1))
+    push = world.builder.AddSystem(ConstantVectorSource([1e3]))
+    world.builder.Connect(world.plant.get_state_output_port(), gain.get_input_port())
+    world.builder.Connect(gain.get_output_port(), offset.get_input_port(0))
+    world.builder.Connect(push.get_output_port(), offset.get_input_port(1))
+    world.builder.Connect(offset.get_output_port(), world.plant.get_actuation_input_port())
+    world.add_rocks()
+    with pytest.raises(SimulationFailure, match="plough"):
+        world.run(10.0)
 
 
 def test_rocks_of_any_size_keep_their_gaps():
