@@ -9,8 +9,8 @@ from drakerock import AddRocks, RocksConfig, scatter_rocks
 from drakerock.resources import find_data
 
 MOTION = np.array([  # time [s], boom, stick and bucket angles [deg]
-    [0.0, 93, -116, -67], [2.5, 93, -116, -67], [4.5, 32, -42, -85], [5.5, 22, -50, -77], [7.5, 28, -80, -78],
-    [9, 32, -93, -124], [11, 50, -86, -154], [12, 50, -86, -154],
+    [0.0, 93, -116, -67], [2.5, 93, -116, -67], [4.5, 32, -42, -85], [5.5, 24, -42, -92], [7.5, 27, -65, -102],
+    [9, 36, -97, -124], [11, 55, -90, -155], [12, 55, -90, -155],
 ])  # fmt: skip
 
 

@@ -16,7 +16,7 @@ def main(out: str = ""):
     add_box(plant, plant.world_body(), size=[3.0, 3.0, 0.5], p=[0.0, 0.0, -0.25])
     plant.Finalize()
     config = RocksConfig(gradation=({"size_m": 0.06, "mass_fraction": 1.0},))
-    p = (pile := scatter_rocks(20, [0.35, -0.3, 0.0], [0.75, 0.3, 0.08], config)).p_WRs
+    p = (pile := scatter_rocks(20, [0.3, -0.35, 0.0], [0.7, 0.35, 0.09], config)).p_WRs
     rock = np.argmax(np.sort(np.linalg.norm(p[:, None] - p, axis=2))[:, 1])  # the farthest from all others
     stops = [reach(*p[rock, :2], z, grip) for z, grip in ((0.3, 0.07), (0.03, 0.07), (0.03, 0.0), (0.4, 0.0))]
     path = drake.PiecewisePolynomial.CubicShapePreserving([0.0, 1.5, 2.0, 3.5], np.array(stops).T, True)
