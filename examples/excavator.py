@@ -9,8 +9,8 @@ from drakerock import AddRocks, RocksConfig, scatter_rocks
 from drakerock.resources import find_data
 
 MOTION = np.array([  # time [s], boom, stick and bucket angles [deg]
-    [0.0, 93, -116, -67], [2.5, 93, -116, -67], [4.5, 32, -42, -85], [5.5, 24, -42, -92], [7.5, 27, -65, -102],
-    [9, 36, -97, -124], [11, 55, -90, -155], [12, 55, -90, -155],
+    [0.0, 93, -116, -67], [2.5, 93, -116, -67], [4.5, 36, -54, -67], [5.5, 28, -61, -59], [7.5, 36, -89, -52],
+    [9.0, 38, -97, -91], [10.5, 51, -91, -141], [12.0, 51, -91, -141],
 ])  # fmt: skip
 
 
