@@ -1,4 +1,4 @@
-"""An excavator digs rocks out of a trench: python examples/excavator.py --out out/excavator.html"""
+"""An excavator digs rocks out of a heap: python examples/excavator.py --out out/excavator.html"""
 
 import numpy as np
 import pydrake.all as drake
@@ -9,8 +9,8 @@ from drakerock import AddRocks, RocksConfig, scatter_rocks
 from drakerock.resources import find_data
 
 MOTION = np.array([  # time [s], boom, stick and bucket angles [deg]
-    [0.0, 93, -116, -67], [2.5, 93, -116, -67], [4.5, 36, -54, -67], [5.5, 28, -61, -59], [7.5, 36, -89, -52],
-    [9.0, 38, -97, -91], [10.5, 51, -91, -141], [12.0, 51, -91, -141],
+    [0.0, 93, -116, -67], [2.5, 93, -116, -67], [4.5, 45, -99, 24], [5.5, 35, -101, 21], [7.5, 38, -103, -30],
+    [9.0, 39, -109, -74], [10.5, 54, -101, -136], [12.0, 54, -101, -136],
 ])  # fmt: skip
 
 
@@ -18,9 +18,7 @@ def main(out: str = ""):
     plant, scene_graph = drake.AddMultibodyPlantSceneGraph(builder := drake.DiagramBuilder(), time_step=0.01)
     (excavator,) = drake.Parser(plant).AddModels(str(find_data("models", "excavator", "excavator.sdf")))
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("house"))
-    for size, p in (([12, 6, 1], [2, 0, -0.5]), ([0.4, 2.4, 1.2], [2.4, 0, 0.6]), ([0.4, 2.4, 1.2], [5.4, 0, 0.6]),
-                    ([2.6, 0.4, 1.2], [3.9, 1, 0.6]), ([2.6, 0.4, 1.2], [3.9, -1, 0.6])):  # fmt: skip
-        add_box(plant, plant.world_body(), size, p)
+    add_box(plant, plant.world_body(), size=[20.0, 20.0, 1.0], p=[4.0, 0.0, -0.5])
     plant.Finalize()
     path = drake.PiecewisePolynomial.CubicShapePreserving(MOTION[:, 0], np.radians(MOTION[:, 1:].T), True)
     motion = builder.AddSystem(drake.TrajectorySource(path, output_derivative_order=1))
