@@ -11,7 +11,7 @@ from drakerock.viewing.replay import write_replay
 class Admittance(drake.LeafSystem):
     def __init__(self, force: float):
         super().__init__()
-        planned, sensed = self.DeclareVectorInputPort("planned", 3), self.DeclareVectorInputPort("bucket_force", 6)
+        planned, sensed = (self.DeclareVectorInputPort(*it) for it in (("planned", 3), ("bucket_force", 6)))
         self.DeclareVectorOutputPort("motor_speeds", 3, lambda context, speeds: speeds.SetFromVector(
             planned.Eval(context) / (1.0 + np.linalg.norm(sensed.Eval(context)[3:]) / force)))  # fmt: skip
 
@@ -32,8 +32,8 @@ def main(out: str = ""):
     station = make_station(scenario, get_pile(scenario), make_controller, visible=False)
     result = run_cycle(scenario, station.rocks.pile, station=station)
     print(f"{result.outcome.bucket_mass_kg:.0f} kg in the bucket at s4")
-    if out:
-        write_replay(result.recording, out)
+    write_replay(result.recording, out) if out else None
+    return result
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ from drakerock import AddRocks, RocksConfig, scatter_rocks
 from drakerock.resources import find_data
 
 MOTION = np.array([  # time [s], boom, stick and bucket angles [deg]
-    [0.0, 93, -116, -67], [2.5, 93, -116, -67], [4.5, 45, -99, 24], [5.5, 35, -101, 21], [7.5, 38, -103, -30],
-    [9.0, 39, -109, -74], [10.5, 54, -101, -136], [12.0, 54, -101, -136],
+    [0.0, 93, -116, -67], [2.5, 93, -116, -67], [4.5, 41, -92, 21], [5.5, 29, -93, 19], [7.5, 35, -107, -23],
+    [9.0, 37, -113, -70], [10.5, 54, -101, -136], [12.0, 54, -101, -136],
 ])  # fmt: skip
 
 
@@ -24,8 +24,9 @@ def main(out: str = ""):
     motion = builder.AddSystem(drake.TrajectorySource(path, output_derivative_order=1))
     builder.Connect(motion.get_output_port(), plant.get_desired_state_input_port(excavator))
     plant.SetDefaultPositions(excavator, path.value(0.0))
-    config = RocksConfig(gradation=({"size_m": 0.2, "mass_fraction": 0.5}, {"size_m": 0.3, "mass_fraction": 0.5}))
-    rocks = AddRocks(builder, plant, scene_graph, scatter_rocks(300, [2.7, -0.75, 0], [5.1, 0.75, 8], config), config)
+    sizes = ({"size_m": 0.2, "mass_fraction": 0.5}, {"size_m": 0.3, "mass_fraction": 0.5})
+    pile = scatter_rocks(300, [2.7, -0.75, 0], [5.1, 0.75, 8], config := RocksConfig(gradation=sizes))
+    rocks = AddRocks(builder, plant, scene_graph, pile, config)
     force = rocks.get_body_force_output_port(plant.GetBodyByName("bucket").index())
     log = drake.LogVectorOutput(force, builder, 0.01)
     data = log.FindLog(simulate(builder, 12.0, out).get_context()).data()

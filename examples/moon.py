@@ -17,7 +17,8 @@ def drop(gravity: float, time: float, out: str = "") -> PileState:
     add_box(plant, plant.world_body(), size=[20.0, 20.0, 1.0], p=[0.0, 0.0, -0.5])
     plant.Finalize()
     config = RocksConfig(gradation=({"size_m": 0.3, "mass_fraction": 1.0},))
-    rocks = AddRocks(builder, plant, scene_graph, scatter_rocks(60, [-0.8, -0.8, 0], [0.8, 0.8, 6], config), config)
+    pile = scatter_rocks(60, [-0.8, -0.8, 0], [0.8, 0.8, 6], config)
+    rocks = AddRocks(builder, plant, scene_graph, pile, config)
     return rocks.get_pile(simulate(builder, time, out).get_context())
 
 

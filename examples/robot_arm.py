@@ -31,8 +31,8 @@ def main(out: str = ""):
     rocks = AddRocks(builder, plant, scene_graph, pile, config)
     root = simulate(builder, 4.0, out).get_context()
     labels = camera.label_image_output_port().Eval(camera.GetMyContextFromRoot(root)).data[:, :, 0]
-    rows, lift = np.nonzero(labels == FIRST_ROCK_LABEL + rock)[0], rocks.get_pile(root).p_WRs[rock, 2] - p[rock, 2]
-    print(f"the rock is lifted by {lift:.2f} m; the camera sees it in {len(rows)} pixels around row {rows.mean():.0f}")
+    pixels, lift = labels == FIRST_ROCK_LABEL + rock, rocks.get_pile(root).p_WRs[rock, 2] - p[rock, 2]
+    print(f"the rock is lifted by {lift:.2f} m, the camera sees it in {pixels.sum()} pixels")
     return rocks.get_pile(root), rock, labels
 
 

@@ -113,7 +113,9 @@ def AddRocks(
             wake_boxes = _make_wake_boxes(geometry, settings.rest.sensor_margin)
         view = builder.AddSystem(PlantView(plant, geometry.bodies, wake_boxes, loops, stiction_tolerance))
         _connect_view(builder, plant, view)
-        builder.Connect(rocks.GetOutputPort("spatial_force_of_others"), view.GetInputPort("applied_spatial_force"))
+        builder.Connect(
+            rocks.GetOutputPort("spatial_force_of_others"), view.GetInputPort("applied_spatial_force")
+        )
         builder.Connect(view.GetOutputPort("plant_step"), rocks.GetInputPort("plant_step"))
     _connect_forces(builder, plant, rocks)
     return rocks
@@ -121,7 +123,9 @@ def AddRocks(
 
 def _require_usable(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
     if builder.HasSubsystemNamed("rocks"):
-        raise InputError("AddRocks: the Diagram has rocks already; add them once, as one pile (PileState.join)")
+        raise InputError(
+            "AddRocks: the Diagram has rocks already; add them once, as one pile (PileState.join)"
+        )
     if not plant.is_finalized():
         raise InputError("AddRocks: the plant is not finalized; call plant.Finalize() before")
     if not plant.time_step() > 0.0:

@@ -36,7 +36,9 @@ def scatter_rocks(
     """
     low, high = np.asarray(low, float), np.asarray(high, float)
     if low.shape != (3,) or high.shape != (3,) or not (low < high).all():
-        raise InputError(f"scatter_rocks: low {low.tolist()} must be below high {high.tolist()} on three axes")
+        raise InputError(
+            f"scatter_rocks: low {low.tolist()} must be below high {high.tolist()} on three axes"
+        )
     config = config or RocksConfig()
     shapes = load_rock_shapes(config.shapes)
     waiting = sample_rocks(n, config, shapes, make_generator(seed, "scattered rocks", "kinds"))

@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 import trimesh
 from pydrake.common.value import Value
-from pydrake.geometry import AddContactMaterial, ProximityProperties, Box, HalfSpace, MeshcatParams, Meshcat, Mesh, SceneGraph, Sphere
+from pydrake.geometry import (
+    AddContactMaterial,
+    Box,
+    HalfSpace,
+    Mesh,
+    Meshcat,
+    MeshcatParams,
+    ProximityProperties,
+    SceneGraph,
+    Sphere,
+)
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import (
@@ -29,7 +39,6 @@ from drakerock.rocks.drake.geometry import read_plant_geometry
 from drakerock.rocks.site import calc_bounds, make_site, make_surroundings
 from drakerock.rocks.state import PileState
 from rock_helpers import make_pile
-
 
 
 def make_material(friction: float) -> ProximityProperties:
@@ -177,7 +186,7 @@ def test_motor_with_gains_that_nothing_drives():
 def test_exported_applied_force():
     world = finalized(World())
     world.builder.ExportInput(world.plant.get_applied_spatial_force_input_port())
-    with pytest.raises(InputError, match="applied_spatial_force.*exported"):
+    with pytest.raises(InputError, match=r"applied_spatial_force.*exported"):
         world.add_rocks()
 
 
@@ -237,7 +246,9 @@ def test_drift_in_a_plant_is_the_site():
 def test_rock_rests_on_a_table_of_another_model():
     world = World()
     table = world.plant.AddRigidBody(
-        "table", world.plant.AddModelInstance("furniture"), SpatialInertia.SolidBoxWithMass(50.0, 2.0, 2.0, 0.1)
+        "table",
+        world.plant.AddModelInstance("furniture"),
+        SpatialInertia.SolidBoxWithMass(50.0, 2.0, 2.0, 0.1),
     )
     world.add_geometry("top", Box(2.0, 2.0, 0.1), [0.0, 0.0, 0.75], table)
     world.plant.WeldFrames(world.plant.world_frame(), table.body_frame())
