@@ -59,7 +59,7 @@ def AddRockBodies(
 ) -> RockBodies:
     """Add one body per rock to `plant` (before Finalize); all fixed rocks are on one that is welded to the world.
 
-    What rocks lie on wants a contact material with a dissipation like theirs (1 s/m): with Drake's default they sink in.
+    What rocks lie on wants a contact material with a dissipation like theirs (1 s/m); with Drake's default they sink.
 
     The plant's output ports are no longer sampled then (`SetUseSampledOutputPorts`): what the rocks' ports say of the
     coming step is not in them otherwise.
