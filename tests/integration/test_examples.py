@@ -9,8 +9,10 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import Simulator
 
-from drakerock import FIRST_ROCK_LABEL, FeedforwardController, load_scenario, run_cycle
+from drakerock import FIRST_ROCK_LABEL, FeedforwardController, load_scenario
+from drakerock.loading.signals import calc_signals
 from drakerock.loading.station import make_station
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -47,7 +49,7 @@ def test_plough_pushes_rocks_with_a_force_in_balance(load, tmp_path):
     # The blade's controller pushes with gain times what is missing in speed: the rocks' force, once it is steady.
     assert 2e3 < -late[3].mean() < 60e3
     assert abs(late[4].mean()) < 0.5 * abs(late[3].mean())
-    assert not forces[:, :100].any()
+    assert not forces[:, :20].any()
     assert pile.p_WRs[:, 2].min() > 0.02
     assert b"rock_0" in page.read_bytes()
 
@@ -90,6 +92,10 @@ def test_admittance_eases_the_force_and_is_the_same_by_its_key(load):
     ours = make_station(soft.scenario, soft.pile_before, visible=False)
     assert isinstance(ours.controller, FeedforwardController)
     assert not isinstance(station.controller, FeedforwardController)
-    again = run_cycle(by_key, soft.pile_before, station=station)
-    for name, column in soft.signals.items():
-        assert np.array_equal(column, again.signals[name], equal_nan=True), name
+    # The first seconds of the dig, bit for bit.
+    simulator = Simulator(station.diagram)
+    station.initialize(simulator.get_mutable_context())
+    simulator.AdvanceTo(3.0)
+    again, _ = calc_signals(station, simulator.get_context())
+    for name, column in again.items():
+        assert np.array_equal(column[:300], soft.signals[name][:300], equal_nan=True), name
