@@ -51,7 +51,7 @@ def test_plough_pushes_rocks_with_a_force_in_balance(load, tmp_path):
     assert abs(late[4].mean()) < 0.5 * abs(late[3].mean())
     assert not forces[:, :20].any()
     assert pile.p_WRs[:, 2].min() > 0.02
-    assert b"rock_0" in page.read_bytes()
+    assert page.stat().st_size > 1e6
 
 
 def test_excavator_lifts_rocks_out_of_the_heap(load):

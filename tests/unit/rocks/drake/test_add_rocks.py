@@ -15,6 +15,7 @@ from pydrake.geometry import (
     Mesh,
     Meshcat,
     MeshcatParams,
+    MeshcatVisualizer,
     ProximityProperties,
     SceneGraph,
     Sphere,
@@ -364,12 +365,15 @@ def test_second_source_of_geometry_in_the_scene_graph():
     assert world.read_pose(ball)[2] == pytest.approx(0.3, abs=0.01)
 
 
-def test_contact_forces_are_drawn():
+def test_rocks_and_contact_forces_are_drawn():
     world = finalized(World())
     rocks = world.add_rocks()
     meshcat = Meshcat(MeshcatParams(show_stats_plot=False))
     RockContactVisualizer.AddToBuilder(world.builder, rocks, meshcat, newtons_per_meter=1e3)
+    MeshcatVisualizer.AddToBuilder(world.builder, world.scene_graph, meshcat)
     world.run(0.5)
+    paths = [f"/drake/visualizer/{name}" for name in ("rock_0", "rocks/rock_0", "rocks")]
+    assert any(meshcat.HasPath(path) for path in paths)
     assert meshcat.HasPath("/drake/rock_contacts/bodies")
     assert meshcat.HasPath("/drake/rock_contacts/rocks")
 
