@@ -20,9 +20,17 @@ from typing import Any
 
 # Imported on first use, so that `import drakerock` and `drakerock --help` stay fast.
 _LAZY: dict[str, str] = {
+    "AddDrift": "drakerock.rocks.drake.drift",
+    "AddRockBodies": "drakerock.rocks.drake.plant_engine",
+    "AddRocks": "drakerock.rocks.drake.add_rocks",
     "DigPlanner": "drakerock.loading.planning",
+    "FIRST_ROCK_LABEL": "drakerock.rocks.drake.scene",
     "FeedforwardController": "drakerock.loading.control",
+    "NonsmoothConfig": "drakerock.rocks.engine.config",
     "PileSensor": "drakerock.loading.sensing",
+    "PileState": "drakerock.rocks.state",
+    "RockContactVisualizer": "drakerock.rocks.drake.contact_visualizer",
+    "RocksConfig": "drakerock.rocks.config",
     "Surrogate": "drakerock.exploration.surrogate",
     "choose_strategy": "drakerock.exploration.strategy",
     "get_pile": "drakerock.study.jobs",
@@ -32,6 +40,7 @@ _LAZY: dict[str, str] = {
     "pareto_front": "drakerock.exploration.pareto",
     "run_cycle": "drakerock.loading.cycle",
     "run_study": "drakerock.study.runner",
+    "scatter_rocks": "drakerock.rocks.making.scatter",
 }
 
 __all__ = ["__version__", *_LAZY]

@@ -38,5 +38,6 @@ def calc_spring_stiffness(
 
 
 def calc_pair_friction(first: float, second: float) -> float:
-    """Return the pair's friction coefficient, 2 a b / (a + b), as Drake combines bodies."""
-    return 2.0 * first * second / (first + second)
+    """Return the pair's friction coefficient, 2 a b / (a + b), as Drake combines bodies; of smooth ones 0."""
+    total = first + second
+    return 2.0 * first * second / total if total > 0.0 else 0.0

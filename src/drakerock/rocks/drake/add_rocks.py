@@ -26,7 +26,7 @@ from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
 
-# How far around pile and bodies a rock may get before it is lost, if no bounds are given [m].
+# How far around the pile a rock may get before it is lost, if no bounds are given [m].
 BOUNDS_MARGIN = 20.0
 # Drake's default, which the plant does not tell in Python [m/s].
 STICTION_TOLERANCE = 1e-3
@@ -69,8 +69,8 @@ def AddRocks(
         engine: settings of the nonsmooth engine; or what `AddRockBodies` returned: then rocks are the plant's own
             bodies, and this only shows them by the same ports.
         shapes: the rock shapes, if not those of `config.shapes`.
-        bounds: lower and upper corner of the box outside of which a rock is lost [m]; default: the box of pile and
-            resting bodies, 20 m wider to all sides.
+        bounds: lower and upper corner of the box outside of which a rock is lost [m]; default: the box of the pile,
+            20 m wider to all sides.
         wake_boxes: where bodies keep the rocks around them awake; default: the box of each body that moves,
             `rest.sensor_margin` wider.
         ignored: proximity geometries that rocks do not meet.
@@ -87,7 +87,7 @@ def AddRocks(
             body without mass, motors that nothing drives. When the Diagram is initialised: a body inside the pile.
     """
     config = config or RocksConfig()
-    _require_usable(plant)
+    _require_usable(builder, plant)
     lower, upper = _find_bounds(pile, bounds)
     geometry = read_plant_geometry(plant, scene_graph, lower, upper, _find_ignored(engine, ignored))
     rocks: RockSystem
@@ -112,12 +112,19 @@ def AddRocks(
             wake_boxes = _make_wake_boxes(geometry, settings.rest.sensor_margin)
         view = builder.AddSystem(PlantView(plant, geometry.bodies, wake_boxes, stiction_tolerance))
         _connect_view(builder, plant, view)
+        builder.Connect(
+            rocks.GetOutputPort("spatial_force_of_others"), view.GetInputPort("applied_spatial_force")
+        )
         builder.Connect(view.GetOutputPort("plant_step"), rocks.GetInputPort("plant_step"))
     _connect_forces(builder, plant, rocks)
     return rocks
 
 
-def _require_usable(plant: MultibodyPlant) -> None:
+def _require_usable(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
+    if builder.HasSubsystemNamed("rocks"):
+        raise InputError(
+            "AddRocks: the Diagram has rocks already; add them once, as one pile (PileState.join)"
+        )
     if not plant.is_finalized():
         raise InputError("AddRocks: the plant is not finalized; call plant.Finalize() before")
     if not plant.time_step() > 0.0:
@@ -161,8 +168,9 @@ def _give_plant_its_own_geometry(
     contact_geometry = scene_graph.Clone()
     contact_geometry.set_name("contact_geometry")
     builder.AddSystem(contact_geometry)
-    source = plant.get_source_id()
-    builder.Connect(plant.get_geometry_pose_output_port(), contact_geometry.get_source_pose_port(source))
+    for k in range(scene_graph.num_input_ports()):
+        port = scene_graph.get_input_port(k)
+        builder.ConnectToSame(port, contact_geometry.GetInputPort(port.get_name()))
     query = plant.get_geometry_query_input_port()
     if builder.IsConnectedOrExported(query):
         builder.Disconnect(scene_graph.get_query_output_port(), query)

@@ -32,8 +32,8 @@ SLAB_THICKNESS = 10.0
 PANEL_THICKNESS = 0.05
 FLOOR_COLOR = (0.35, 0.33, 0.31, 1.0)
 WALL_COLOR = (0.45, 0.43, 0.41, 0.25)
-DRIFT_LABEL = 1
-"""Render label of the drift for cameras."""
+DRIFT_LABEL = 1999
+"""Render label of the drift for cameras; a plant's bodies have their index."""
 
 
 def AddDrift(plant: MultibodyPlant, site: Site, config: PlantEngineConfig | None = None) -> None:

@@ -12,8 +12,6 @@ from pydrake.geometry import (
     AddContactMaterial,
     GeometryId,
     GeometryInstance,
-    IllustrationProperties,
-    PerceptionProperties,
     ProximityProperties,
 )
 from pydrake.math import RigidTransform
@@ -27,7 +25,7 @@ from drakerock.rocks.config import RocksConfig
 from drakerock.rocks.drake.drift import make_convex
 from drakerock.rocks.drake.interface import ROCK_SUMMARY, RockContacts, RockSystem, make_empty_contacts
 from drakerock.rocks.drake.poses import make_pose
-from drakerock.rocks.drake.scene import make_rock_looks
+from drakerock.rocks.drake.scene import make_illustration, make_perception
 from drakerock.rocks.engine.config import PlantEngineConfig
 from drakerock.rocks.engine.motion import HUGE
 from drakerock.rocks.materials import calc_spring_stiffness
@@ -62,6 +60,11 @@ def AddRockBodies(
 ) -> RockBodies:
     """Add one body per rock to `plant` (before Finalize); all fixed rocks are on one that is welded to the world.
 
+    What rocks lie on wants a contact material with a dissipation like theirs (1 s/m); with Drake's default they sink.
+
+    The plant's output ports are no longer sampled then (`SetUseSampledOutputPorts`): what the rocks' ports say of the
+    coming step is not in them otherwise.
+
     On the world's own body hundreds of them beside the floor, a half-space whose box has no bounds, make Drake read
     stray memory (1.58: a segmentation fault when they are registered).
 
@@ -83,12 +86,13 @@ def AddRockBodies(
         raise InputError("AddRockBodies: the plant is finalized; add rocks as bodies before Finalize()")
     rocks, config = rocks or RocksConfig(), config or PlantEngineConfig()
     shapes = shapes or load_rock_shapes(rocks.shapes, rocks.max_corners)
+    # Its contacts are then those of the step that begins.
+    plant.SetUseSampledOutputPorts(False)
     instance = plant.AddModelInstance("rocks")
     kinds = {
         (shape, size): _make_kind(shapes[shape], size, rocks, config, reference_overlap)
         for shape, size in sorted({(int(k), float(s)) for k, s in zip(pile.shape, pile.size, strict=True)})
     }
-    looks = (make_rock_looks(IllustrationProperties), make_rock_looks(PerceptionProperties))
     if pile.fixed.any():
         solid = plant.AddRigidBody("fixed_rocks", instance, SpatialInertia.Zero())
         plant.WeldFrames(plant.world_frame(), solid.body_frame())
@@ -103,8 +107,8 @@ def AddRockBodies(
             plant.SetDefaultFloatingBaseBodyPose(body, X_WR)
         geometries.append(plant.RegisterCollisionGeometry(body, X_BG, convex, name, properties))
         look = GeometryInstance(X_BG, convex, f"{name}_look")
-        look.set_illustration_properties(looks[0])
-        look.set_perception_properties(looks[1])
+        look.set_illustration_properties(make_illustration(bool(pile.fixed[rock])))
+        look.set_perception_properties(make_perception(rock, bool(pile.fixed[rock])))
         plant.RegisterVisualGeometry(body, look)
     return RockBodies(pile, shapes, tuple(geometries))
 

@@ -27,7 +27,7 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlan
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, ModelInstanceIndex, MultibodyForces
 from pydrake.systems.framework import Context, InputPort, LeafSystem, ValueProducer
 
-from drakerock.errors import InputError
+from drakerock.errors import InputError, SimulationFailure
 from drakerock.memory import weak
 from drakerock.rocks.drake.ball_constraints import BallConstraint, read_ball_constraints
 from drakerock.rocks.drake.geometry import Material, read_material
@@ -39,12 +39,16 @@ from drakerock.rocks.engine.machine_step import (
     calc_free_motion,
     make_machine_arrays,
 )
+from drakerock.rocks.engine.motion import HUGE
+from drakerock.rocks.materials import calc_pair_friction
 
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
 # Within this distance of its stop a joint has a row for it [rad, m].
 STOP_MARGIN = 0.05
+# Friction below this is as good as none; the laws divide by it.
+SMOOTH = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +71,9 @@ class PlantView(LeafSystem):
     Input ports:
         ``state``: the plant's whole state.
         ``geometry_query``: for the plant's own contacts.
-        ``actuation``, ``MODEL_actuation``, ``MODEL_desired_state``, ``applied_generalized_force``,
-            ``applied_spatial_force``: what the plant's ports of these names get; those that are not connected there
-            need not be here.
+        ``actuation``, ``MODEL_actuation``, ``MODEL_desired_state``, ``applied_generalized_force``: what the plant's
+            ports of these names get; those that are not connected there need not be here.
+        ``applied_spatial_force``: what others than rocks apply.
 
     Output port ``plant_step``: a `MachineStep`.
     """
@@ -142,7 +146,11 @@ class PlantView(LeafSystem):
         plant = self._plant
         h = plant.time_step()
         scratch = self.get_cache_entry(self._scratch).Eval(context)
-        plant.SetPositionsAndVelocities(scratch, self._state.Eval(context))
+        state = self._state.Eval(context)
+        if not (np.abs(state) < HUGE).all():
+            # Neither Drake's proximity engine nor the search for rocks survives such poses.
+            raise SimulationFailure(f"{self._find_lost_body(state)}: its position or velocity is not finite")
+        plant.SetPositionsAndVelocities(scratch, state)
         v, positions = plant.GetVelocities(scratch), plant.GetPositions(scratch)
         generalised, joints = self._calc_own_forces(context, scratch, positions, h)
         inverse, free_change = calc_free_motion(
@@ -179,6 +187,16 @@ class PlantView(LeafSystem):
             for number, corners in self._wake_boxes
         ]
         output.set_value(MachineStep(X_WBs, v, free_change, arrays, np.array(boxes, float).reshape(-1, 18)))
+
+    def _find_lost_body(self, state: Array) -> str:
+        n_q = self._plant.num_positions()
+        for index in self._plant.GetJointIndices():
+            joint = self._plant.get_joint(index)
+            q = state[joint.position_start() :][: joint.num_positions()]
+            v = state[n_q + joint.velocity_start() :][: joint.num_velocities()]
+            if not ((np.abs(q) < HUGE).all() and (np.abs(v) < HUGE).all()):
+                return f"body '{joint.child_body().scoped_name()}'"
+        return "the plant"
 
     def _calc_own_forces(
         self, context: Context, scratch: Context, positions: Array, h: float
@@ -258,7 +276,7 @@ class PlantView(LeafSystem):
         for pair in query.ComputePointPairPenetration():
             body_A, of_A = self._find_material(query, pair.id_A)
             body_B, of_B = self._find_material(query, pair.id_B)
-            if body_A is None and body_B is None:
+            if (body_A is None and body_B is None) or not pair.depth > 0.0:
                 continue
             # nhat_BA_W points out of B into A
             number, other, sign = (body_A, body_B, 1.0) if body_A is not None else (body_B, None, -1.0)
@@ -271,7 +289,7 @@ class PlantView(LeafSystem):
                     *(0.5 * (a + b) for a, b in sides),
                     pair.depth,
                     of_A.stiffness * of_B.stiffness / (of_A.stiffness + of_B.stiffness),
-                    2.0 * of_A.friction * of_B.friction / (of_A.friction + of_B.friction),
+                    max(calc_pair_friction(of_A.friction, of_B.friction), SMOOTH),
                     NO_BODY if other is None else other,
                 ]
             )

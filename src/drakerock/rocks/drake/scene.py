@@ -13,6 +13,7 @@ from pydrake.geometry import (
     IllustrationProperties,
     PerceptionProperties,
     ProximityProperties,
+    RenderLabel,
     SceneGraph,
     SourceId,
 )
@@ -27,14 +28,19 @@ from drakerock.rocks.state import PileState, make_empty_pile
 
 ROCK_COLOR = (0.55, 0.47, 0.38, 1.0)
 FIXED_COLOR = (0.45, 0.45, 0.45, 1.0)
-ROCK_LABEL = 2
-"""Render label of rocks for cameras."""
+FIRST_ROCK_LABEL = 2000
+"""Render label of the first rock for cameras, the next is the second's; a plant's bodies have their index."""
 
 
-def make_rock_looks[P](kind: type[P], fixed: bool = False) -> P:
-    """Return illustration or perception properties of a rock."""
-    color = FIXED_COLOR if fixed else ROCK_COLOR
-    return make_looks(kind, color, ROCK_LABEL if kind is PerceptionProperties else None)
+def make_illustration(fixed: bool) -> IllustrationProperties:
+    """Return how a rock looks in Meshcat."""
+    return make_looks(IllustrationProperties, FIXED_COLOR if fixed else ROCK_COLOR)
+
+
+def make_perception(rock: int, fixed: bool) -> PerceptionProperties:
+    """Return how a rock looks to cameras."""
+    label = min(FIRST_ROCK_LABEL + rock, int(RenderLabel.kMaxUnreserved))
+    return make_looks(PerceptionProperties, FIXED_COLOR if fixed else ROCK_COLOR, label)
 
 
 class RockPoses(LeafSystem):
@@ -98,10 +104,7 @@ def register_rocks(
         (int(k), float(s)): make_convex(shapes[int(k)].vertices, shapes[int(k)].name, float(s))
         for k, s in {(int(k), float(s)) for k, s in zip(pile.shape, pile.size, strict=True)}
     }
-    looks = {
-        fixed: (make_rock_looks(IllustrationProperties, fixed), make_rock_looks(PerceptionProperties, fixed))
-        for fixed in (False, True)
-    }
+    illustration = {fixed: make_illustration(fixed) for fixed in (False, True)}
     X_WRs = np.zeros((len(pile), 3, 4))
     if len(pile):
         X_WRs[:, :, :3] = Rotation.from_quat(pile.q_WRs, scalar_first=True).as_matrix()
@@ -111,8 +114,8 @@ def register_rocks(
         fixed, name = bool(pile.fixed[rock]), f"rock_{rock}"
         X = RigidTransform(X_WRs[rock]) if fixed else RigidTransform()
         instance = GeometryInstance(X, convex[int(pile.shape[rock]), float(pile.size[rock])], name)
-        instance.set_illustration_properties(looks[fixed][0])
-        instance.set_perception_properties(looks[fixed][1])
+        instance.set_illustration_properties(illustration[fixed])
+        instance.set_perception_properties(make_perception(rock, fixed))
         if proximity is not None:
             instance.set_proximity_properties(proximity)
         if fixed:

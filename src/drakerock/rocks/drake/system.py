@@ -18,6 +18,7 @@ from pydrake.systems.framework import (
     Context,
     DiscreteValues,
     EventStatus,
+    State,
     ValueProducer,
 )
 
@@ -39,8 +40,9 @@ from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
 
-# A body of the plant that starts so deep in a rock starts inside the pile [m].
+# A body of the plant that starts so deep in a rock starts inside the pile: [m], and as a share of the rock's size.
 START_PENETRATION = 0.05
+START_SHARE = 1 / 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,7 @@ class NonsmoothRocks(RockSystem):
             open.
 
     Output ports: those of `RockSystem`, and
+        ``spatial_force_of_others``: the input ``applied_spatial_force``, empty where it is left open.
         ``applied_spatial_force``: list of ExternallyAppliedSpatialForce for the plant: the rocks' forces on its bodies
             over the coming step, then those of others.
         ``status``: (n,) 0 awake, 1 resting, 2 fixed, 3 lost.
@@ -121,13 +124,28 @@ class NonsmoothRocks(RockSystem):
             {step.ticket()},
         )
         self.DeclareAbstractOutputPort(
+            "spatial_force_of_others",
+            lambda: Value[list[ExternallyAppliedSpatialForce]]([]),
+            weak(self._calc_others),
+            {self._others.ticket()},
+        )
+        self.DeclareAbstractOutputPort(
             "applied_spatial_force",
             lambda: Value[list[ExternallyAppliedSpatialForce]]([]),
             weak(self._calc_applied_force),
             {step.ticket(), self._others.ticket()},
         )
         self.DeclareInitializationPublishEvent(self._check_start)
-        self.DeclarePeriodicDiscreteUpdateEvent(engine.time_step, 0.0, self._update)
+        # Together with the plant's own update, from the same state: Drake does unrestricted updates first, and a plant
+        # whose output ports are sampled has one.
+        if plant.has_sampled_output_ports():
+            self.DeclarePeriodicUnrestrictedUpdateEvent(
+                engine.time_step,
+                0.0,
+                self._update_with_plant,
+            )
+        else:
+            self.DeclarePeriodicDiscreteUpdateEvent(engine.time_step, 0.0, self._update)
 
     @property
     def engine(self) -> NonsmoothEngine:
@@ -202,6 +220,9 @@ class NonsmoothRocks(RockSystem):
         assert step.report is not None
         return step.arrays, step.report
 
+    def _update_with_plant(self, context: Context, state: State) -> None:
+        self._update(context, state.get_mutable_discrete_state())
+
     def _update(self, context: Context, discrete: DiscreteValues) -> None:
         arrays, report = self._solve(context)
         last = self._read_report(context)
@@ -223,15 +244,15 @@ class NonsmoothRocks(RockSystem):
 
     def _check_start(self, context: Context) -> EventStatus:
         found = self._find_contacts(context)
-        moving = found.body > 0
-        if moving.any():
-            k = int(np.argmax(np.where(moving, found.depth, -np.inf)))
-            if found.depth[k] > START_PENETRATION:
-                body = self._plant.get_body(BodyIndex(int(found.body[k])))
-                raise InputError(
-                    f"body '{body.scoped_name()}' starts {found.depth[k]:.2f} m inside a rock at "
-                    f"{np.round(found.p_WCs[k], 2).tolist()}: place it outside the pile before the simulation starts"
-                )
+        allowed = np.minimum(START_PENETRATION, START_SHARE * self._default_pile.size[found.rock])
+        excess = np.where(found.body > 0, found.depth - allowed, -np.inf)
+        if len(found) and excess.max() > 0.0:
+            k = int(np.argmax(excess))
+            body = self._plant.get_body(BodyIndex(int(found.body[k])))
+            raise InputError(
+                f"body '{body.scoped_name()}' starts {found.depth[k]:.2f} m inside a rock at "
+                f"{np.round(found.p_WCs[k], 2).tolist()}: place it outside the pile before the simulation starts"
+            )
         return EventStatus.Succeeded()
 
     def _find_contacts(self, context: Context) -> RockContacts:
@@ -274,6 +295,12 @@ class NonsmoothRocks(RockSystem):
     def _calc_contacts(self, context: Context, output: Value) -> None:
         output.set_value(self._find_contacts(context))
 
+    def _calc_others(self, context: Context, output: Value) -> None:
+        output.set_value(self._read_others(context))
+
+    def _read_others(self, context: Context) -> list[ExternallyAppliedSpatialForce]:
+        return self._others.Eval(context) if self._others.HasValue(context) else []
+
     def _calc_applied_force(self, context: Context, output: Value) -> None:
         _, report = self._solve(context)
         forces = []
@@ -284,9 +311,7 @@ class NonsmoothRocks(RockSystem):
                 force.p_BoBq_B = np.zeros(3)
                 force.F_Bq_W = SpatialForce(F_B_W[:3], F_B_W[3:])
                 forces.append(force)
-        if self._others.HasValue(context):
-            forces += self._others.Eval(context)
-        output.set_value(forces)
+        output.set_value(forces + self._read_others(context))
 
 
 _N_LOST = list(ROCK_SUMMARY).index("n_lost")
