@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_origin
 
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
@@ -24,6 +24,8 @@ def _find_number(key: str) -> type:
     model: type[BaseModel] | None = Scenario
     annotation: Any = None
     for part in key.split("."):
+        if get_origin(annotation) is dict:
+            return float  # of a part of one's own; `_check_parameters` knows its name
         names = model.model_fields if model is not None else {}
         if part not in names:
             near = difflib.get_close_matches(part, names, n=1)
@@ -169,6 +171,7 @@ class StudyConfig(Config):
     @model_validator(mode="after")
     def _check(self) -> Self:
         keys = [variable.key for variable in self.variables]
+        self._check_parameters(keys)
         twice = sorted({key for key in keys if keys.count(key) > 1})
         if twice:
             raise ValueError(f"variables: one variable per scenario key; used twice: {', '.join(twice)}")
@@ -226,6 +229,16 @@ class StudyConfig(Config):
             seed = derive_seed(seed, "attempt", attempt) if self.failures.new_seed else seed
             step *= self.failures.time_step_factor**attempt
         return scenario.replace(**{"seed": seed, "dynamics.time_step": step})
+
+    def _check_parameters(self, keys: list[str]) -> None:
+        """Raise ValueError for a parameter of a part that the scenario does not give: a misspelt one, most likely."""
+        for key in keys:
+            room, found, name = key.partition(".parameters.")
+            if found:
+                given = getattr(self.scenario.loading.parts, room.split(".")[-1]).parameters
+                if name not in given:
+                    near = f"it gives {', '.join(sorted(given))}" if given else "it gives none"
+                    raise ValueError(f"variables: the scenario gives no parameter {key}; {near}")
 
     def _set_variables(self, values: Mapping[str, float]) -> Scenario:
         data = self.scenario.model_dump(mode="json")

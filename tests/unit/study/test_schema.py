@@ -147,3 +147,18 @@ def test_json_schema_describes_the_keys():
     assert schema["additionalProperties"] is False
     assert {"variables", "objectives", "loadings", "executor", "storage"} <= set(schema["properties"])
     assert schema["$defs"]["StrategyConfig"]["properties"]["alpha"]["maximum"] == 2
+
+
+def test_a_study_varies_the_parameters_of_a_part_of_ones_own(write):
+    parts = {"controller": {"system": "examples/admittance.py:make_controller", "parameters": {"force": 1e5}}}
+    variable = {
+        "name": "force", "key": "loading.parts.controller.parameters.force", "low": 1e4, "high": 1e6
+    }  # fmt: skip
+    study = load_study(write(scenario={"loading": {"parts": parts}}, variables=[variable]))
+    scenario = study.make_scenario(np.array([2e5]))
+    assert scenario.loading.parts.controller.parameters == {"force": 2e5}
+    variable["key"] = "loading.parts.controller.parameters.fource"
+    with pytest.raises(
+        InputError, match=r"no parameter loading.parts.controller.parameters.fource; it gives force"
+    ):
+        load_study(write(scenario={"loading": {"parts": parts}}, variables=[variable]))
