@@ -35,11 +35,15 @@ STEP = """
 import time
 from pydrake.systems.analysis import Simulator
 from drakerock import get_pile, load_scenario, make_station
+from drakerock.lhd.placement import set_machine_pose
 scenario = load_scenario({scenario!r})
 pile = get_pile(scenario)
 station = make_station(scenario, pile)
 simulator = Simulator(station.diagram)
-station.rocks.set_pile(simulator.get_mutable_context(), pile)
+root = simulator.get_mutable_context()
+station.rocks.set_pile(root, pile)
+context = station.plant.GetMyMutableContextFromRoot(root)
+set_machine_pose(station.plant, context, station.machine, x_tip=-15.0, y=0.0, z_tip=0.03)
 simulator.AdvanceTo(0.05)
 start = time.process_time()
 simulator.AdvanceTo(1.05)
@@ -69,7 +73,7 @@ CASES = {
 }
 MEANING = {
     "load": "drakerock load of the demo's cycle",
-    "step": "a second of the station's Diagram, machine standing",
+    "step": "a second of the station's Diagram, machine standing off the pile",
     "help": "drakerock --help",
     "refill": "a refill after 120 rocks",
 }
