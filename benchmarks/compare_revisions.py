@@ -54,7 +54,7 @@ import time
 import numpy as np
 from drakerock import get_pile, load_scenario
 from drakerock.loading.scenario import make_recipe
-from drakerock.rocks.making.settling import refill
+from drakerock.rocks.making.refill import refill
 from drakerock.rocks.shapes import load_rock_shapes
 scenario = load_scenario({scenario!r})
 pile = get_pile(scenario)

@@ -59,8 +59,8 @@ from drakerock.loading.scenario import Scenario
 from drakerock.rocks.config import PileConfig, SiteConfig
 from drakerock.rocks.drake.system import NonsmoothRocks
 from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
+from drakerock.rocks.making.make import make_pile
 from drakerock.rocks.making.recipe import PileRecipe
-from drakerock.rocks.making.settling import make_pile
 from drakerock.rocks.state import PileState
 
 # Per size of pile: number of rocks, site and emission height.

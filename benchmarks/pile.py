@@ -19,8 +19,11 @@ from pathlib import Path
 import numpy as np
 
 from drakerock.loading.scenario import Scenario, make_recipe
+from drakerock.rocks.making.cache import fetch_pile
 from drakerock.rocks.making.emission import calc_level, make_emitter
-from drakerock.rocks.making.settling import calc_creep, fetch_pile, make_pile, refill, settle
+from drakerock.rocks.making.make import make_pile
+from drakerock.rocks.making.refill import refill
+from drakerock.rocks.making.settle import calc_creep, settle
 from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.site import make_site
 from drakerock.rocks.state import save_pile

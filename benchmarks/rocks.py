@@ -32,7 +32,7 @@ from drakerock.rocks.drake.plant import add_plant
 from drakerock.rocks.drake.system import NonsmoothRocks
 from drakerock.rocks.engine.config import DynamicsConfig, NonsmoothConfig
 from drakerock.rocks.engine.engine import NonsmoothEngine
-from drakerock.rocks.making.settling import fetch_pile
+from drakerock.rocks.making.cache import fetch_pile
 from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.site import make_site, make_surroundings
 from drakerock.rocks.state import PileState, load_pile

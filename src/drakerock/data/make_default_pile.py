@@ -10,7 +10,7 @@ from pathlib import Path
 
 from drakerock.identity import RESULTS_REVISION, calc_config_hash
 from drakerock.loading.scenario import Scenario, make_recipe
-from drakerock.rocks.making.settling import make_pile
+from drakerock.rocks.making.make import make_pile
 from drakerock.rocks.state import PileState, load_pile, save_pile
 
 PATH = Path(__file__).with_name("default_pile.npz")

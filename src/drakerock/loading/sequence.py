@@ -15,7 +15,8 @@ from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.memory import free_diagrams
 from drakerock.randomness import make_generator
-from drakerock.rocks.making.settling import fetch_pile, refill
+from drakerock.rocks.making.cache import fetch_pile
+from drakerock.rocks.making.refill import refill
 from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.state import PileState, load_pile, save_pile
 

@@ -19,7 +19,8 @@ from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.recording import load_recording
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.loading.sequence import run_sequence
-from drakerock.rocks.making.settling import calc_creep, fetch_pile
+from drakerock.rocks.making.cache import fetch_pile
+from drakerock.rocks.making.settle import calc_creep
 from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.site import make_site
 from drakerock.rocks.state import PileState, save_pile

@@ -8,7 +8,8 @@ import pytest
 from drakerock.identity import calc_config_hash
 from drakerock.loading.scenario import Scenario, load_scenario, make_recipe
 from drakerock.resources import find_data
-from drakerock.rocks.making.settling import check_pile, fetch_pile, settle
+from drakerock.rocks.making.cache import check_pile, fetch_pile
+from drakerock.rocks.making.settle import settle
 from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.site import make_site
 from drakerock.rocks.summary import calc_gradation, calc_imbalance, calc_packing, calc_slope, calc_support

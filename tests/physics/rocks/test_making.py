@@ -9,16 +9,11 @@ from drakerock.errors import InputError
 from drakerock.identity import calc_config_hash
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.rocks.contact_graph import find_loose
+from drakerock.rocks.making.cache import check_pile, fetch_pile
 from drakerock.rocks.making.emission import calc_level, make_emitter, sample_rocks
-from drakerock.rocks.making.settling import (
-    WAITING,
-    calc_creep,
-    check_pile,
-    fetch_pile,
-    make_pile,
-    refill,
-    settle,
-)
+from drakerock.rocks.making.make import make_pile
+from drakerock.rocks.making.refill import WAITING, refill
+from drakerock.rocks.making.settle import calc_creep, settle
 from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.site import make_site
 from drakerock.rocks.state import save_pile

@@ -14,7 +14,7 @@ from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.rocks.config import RocksConfig, SizeClass
 from drakerock.rocks.engine.collision.shapes import make_convex_shapes
 from drakerock.rocks.engine.config import NonsmoothConfig
-from drakerock.rocks.making import settling
+from drakerock.rocks.making import make
 from drakerock.rocks.shapes import (
     MAX_ASPECT,
     calc_aspect,
@@ -175,16 +175,16 @@ def test_a_gradation_with_fines_is_refused_with_the_number_of_rocks():
     with pytest.raises(
         InputError, match=r"rocks.gradation: .* about 5\d{6} rocks, .* size_m 0.02; at most 100000"
     ):
-        settling.make_pile(recipe)
+        make.make_pile(recipe)
 
 
 def test_number_of_rocks_is_told_before_they_fall(caplog, monkeypatch):
     def stop(*_arguments, **_options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(settling, "drop_rocks", stop)
+    monkeypatch.setattr(make, "drop_rocks", stop)
     with pytest.raises(KeyboardInterrupt):
-        settling.make_pile(make_recipe(Scenario()))
+        make.make_pile(make_recipe(Scenario()))
     # The shipped pile, of this recipe, has 5 770.
     number = int(read(caplog).split("about ")[1].split()[0])
     assert number == pytest.approx(5770, rel=0.1)

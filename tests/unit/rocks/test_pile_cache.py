@@ -10,8 +10,8 @@ import pytest
 
 from drakerock.identity import calc_config_hash
 from drakerock.loading.scenario import Scenario, make_recipe
-from drakerock.rocks.making import settling
-from drakerock.rocks.making.settling import fetch_pile
+from drakerock.rocks.making import cache
+from drakerock.rocks.making.cache import fetch_pile
 from drakerock.rocks.state import load_pile
 
 RECIPE = make_recipe(Scenario(seed=17))
@@ -21,7 +21,7 @@ RECIPE = make_recipe(Scenario(seed=17))
 def made(heap, monkeypatch):
     """The recipes that a pile is made of: always the same one, at once."""
     recipes = []
-    monkeypatch.setattr(settling, "make_pile", lambda recipe, _progress: recipes.append(recipe) or heap)
+    monkeypatch.setattr(cache, "make_pile", lambda recipe, _progress: recipes.append(recipe) or heap)
     return recipes
 
 
