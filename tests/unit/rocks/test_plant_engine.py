@@ -174,14 +174,14 @@ def test_the_nonsmooth_engines_linear_law_has_the_plants_springs(heap, shapes):
     )
     inspector = scene_graph.model_inspector()
 
-    def get_softness(geometry):
+    def get_compliance(geometry):
         return 1.0 / inspector.GetProximityProperties(geometry).GetProperty(
             "material", "point_contact_stiffness"
         )
 
-    rocks, still, bodies = np.split(engine.softness, [len(heap), len(heap) + 1])
-    assert rocks == pytest.approx([get_softness(geometry) for geometry in geometries])
+    rocks, still, bodies = np.split(engine.contact_compliance, [len(heap), len(heap) + 1])
+    assert rocks == pytest.approx([get_compliance(geometry) for geometry in geometries])
     assert still == 0.0
-    for softness, index in zip(bodies, found.bodies, strict=True):
+    for compliance, index in zip(bodies, found.bodies, strict=True):
         body = plant.get_body(index)
-        assert softness == get_softness(plant.GetCollisionGeometriesForBody(body)[0])
+        assert compliance == get_compliance(plant.GetCollisionGeometriesForBody(body)[0])

@@ -28,7 +28,17 @@ from drakerock.rocks.engine.compiling import announce_compilation
 from drakerock.rocks.engine.config import NonsmoothConfig
 from drakerock.rocks.engine.contact_cache import CacheIndex, ContactCache
 from drakerock.rocks.engine.contact_law import ContactLaw
-from drakerock.rocks.engine.records import AWAKE, BODY, FIXED, LOST, SENSOR, SLEEP, SLEEPING, as_records
+from drakerock.rocks.engine.records import (
+    AWAKE,
+    BODY,
+    FIXED,
+    LOST,
+    SENSOR,
+    SLEEP,
+    SLEEPING,
+    as_records,
+    copy_records,
+)
 from drakerock.rocks.engine.solve.batches import make_batch_arrays, make_single_bodies
 from drakerock.rocks.engine.solve.gauss_seidel import IterationSettings, solve_contacts
 from drakerock.rocks.engine.solve.impacts import solve_impacts
@@ -356,7 +366,7 @@ class NonsmoothEngine:
         """
         for name in MOTION:
             getattr(target, name)[report.awake] = getattr(new, name)[report.awake]
-        target.sleep[:] = new.sleep
+        copy_records(new.sleep, target.sleep)
         target.cache.pairs[report.freed] = -1
         changed = slice(report.n_kept, len(new.cache.pairs))
         for before, after in zip(target.cache, new.cache, strict=True):
@@ -439,7 +449,7 @@ class NonsmoothEngine:
         """Return state and report of a step; None if they are not finite."""
         dt = self.time_step
         new = replace(room, steps=arrays.steps + 1)
-        new.sleep[:] = arrays.sleep
+        copy_records(arrays.sleep, new.sleep)
         sensors = as_records(machine.sensors, SENSOR)
         n_woken = self._wake(arrays, new, sensors)
         status = new.sleep["status"].astype(np.int64)

@@ -151,3 +151,8 @@ def as_matrix(records: np.ndarray) -> np.ndarray:
 def as_records(matrix: np.ndarray, record: np.dtype[Any]) -> np.ndarray:
     """Return a matrix (n, columns) as records (n,), in the same memory if its rows lie in line."""
     return np.ascontiguousarray(matrix, record[0].base).reshape(-1).view(record)
+
+
+def copy_records(source: np.ndarray, target: np.ndarray) -> None:
+    """Copy records as numbers: numpy copies them field by field where fields share their room, thirty times slower."""
+    as_matrix(target)[:] = as_matrix(source)
