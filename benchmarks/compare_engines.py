@@ -99,13 +99,14 @@ class Dig:
     def __init__(self, pile: PileState, variant: Variant, depth: float) -> None:
         dynamics = DynamicsConfig(
             rocks="nonsmooth" if variant.engine == "nonsmooth" else "plant",
-            nonsmooth=NonsmoothConfig(reduction="none", **variant.nonsmooth),
             plant=PlantEngineConfig(
                 contact_model="hydroelastic" if variant.engine == "hydroelastic" else "point",
                 dissipation=variant.dissipation,
             ),
             time_step=variant.time_step,
         )
+        if variant.engine == "nonsmooth":
+            dynamics = dynamics.replace(nonsmooth=NonsmoothConfig(reduction="none", **variant.nonsmooth))
         builder = DiagramBuilder()
         self.plant, scene_graph = add_plant(builder, dynamics)
         AddDrift(self.plant, make_site(SMALL_SITE), dynamics.plant)

@@ -18,6 +18,7 @@ from pydrake.geometry import (
     HalfSpace,
     Mesh,
     SceneGraph,
+    SceneGraphConfig,
     SceneGraphInspector,
     Shape,
     Sphere,
@@ -32,9 +33,9 @@ from drakerock.rocks.engine.engine import MachinePiece
 
 Array = NDArray[np.float64]
 
-# Drake's defaults for what says nothing of its material: point stiffness [N/m], friction.
-POINT_STIFFNESS = 1e8
-FRICTION = 1.0
+# SceneGraph's defaults for what says nothing of its material: point stiffness [N/m], friction.
+POINT_STIFFNESS = SceneGraphConfig().default_proximity_properties.point_stiffness
+FRICTION = SceneGraphConfig().default_proximity_properties.dynamic_friction
 # A mesh whose hull has so much more volume than the mesh itself is not convex.
 CONVEXITY_TOLERANCE = 0.01
 # Corners around a cylinder, an ellipsoid's rings, and where along its y axis these are [half axes].

@@ -13,7 +13,8 @@ def add_plant(builder: DiagramBuilder, config: DynamicsConfig) -> tuple[Multibod
     """Add a discrete MultibodyPlant and its SceneGraph.
 
     The output ports are not sampled, so that the plant's state is purely discrete and what is read at a time
-    (contact forces, reactions) belongs to the step that starts then.
+    (contact forces, reactions) belongs to the step that starts then. With `sap` every geometry that says nothing of its
+    relaxation time gets the configuration's.
     """
     plant, scene_graph = AddMultibodyPlant(
         MultibodyPlantConfig(
@@ -26,4 +27,8 @@ def add_plant(builder: DiagramBuilder, config: DynamicsConfig) -> tuple[Multibod
         builder,
     )
     plant.set_name("plant")
+    if config.contact_approximation == "sap":
+        settings = scene_graph.get_config()
+        settings.default_proximity_properties.relaxation_time = config.plant.relaxation_time
+        scene_graph.set_config(settings)
     return plant, scene_graph

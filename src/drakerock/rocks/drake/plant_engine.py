@@ -134,7 +134,8 @@ def _make_kind(
     )
     if config.contact_model == "hydroelastic":
         AddCompliantHydroelasticProperties(
-            resolution_hint=config.hydroelastic_resolution * size,
+            # Drake wants a hint, and does without it for convex shapes.
+            resolution_hint=0.5 * size,
             hydroelastic_modulus=config.hydroelastic_modulus,
             properties=properties,
         )

@@ -189,7 +189,20 @@ class PlantEngineConfig(Config):
             description="of rocks [Pa]; softer, faces carry over small patches, and rocks roll off each other",
         ),
     ] = 1e9
-    hydroelastic_resolution: Annotated[float, Field(gt=0, description="hint, share of a rock's size")] = 0.5
+    relaxation_time: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=1,
+            description="of every body, with `contact_approximation: sap` [s]; by Drake's own 0.1 rocks sink",
+        ),
+    ] = 0.005
+
+    @model_validator(mode="after")
+    def _check_effect(self) -> PlantEngineConfig:
+        if self.contact_model == "point" and self.hydroelastic_modulus != 1e9:
+            raise ValueError("hydroelastic_modulus has no effect with contact_model: point")
+        return self
 
 
 class DynamicsConfig(Config):
@@ -208,3 +221,21 @@ class DynamicsConfig(Config):
     ] = 1e-3
     plant: PlantEngineConfig = PlantEngineConfig()
     nonsmooth: NonsmoothConfig = NonsmoothConfig()
+
+    @model_validator(mode="after")
+    def _check_effect(self) -> DynamicsConfig:
+        """Refuse what would have no effect: it is taken for more than it is."""
+        plant, sap = PlantEngineConfig(), self.contact_approximation == "sap"
+        idle = {
+            "stiction_tolerance": sap and self.stiction_tolerance != 1e-2,
+            "plant.dissipation": sap and self.plant.dissipation != plant.dissipation,
+            "plant.relaxation_time": not sap and self.plant.relaxation_time != plant.relaxation_time,
+        }
+        for key, is_idle in idle.items():
+            if is_idle:
+                raise ValueError(
+                    f"{key} has no effect with contact_approximation: {self.contact_approximation}"
+                )
+        if self.rocks == "plant" and self.nonsmooth != NonsmoothConfig():
+            raise ValueError("nonsmooth has no effect with rocks: plant")
+        return self
