@@ -47,10 +47,10 @@ def make_plane_site(friction: float = 1.125, slope: float = 0.0, planes: int = 1
     """A floor, inclined by `slope` [rad] down along +x; with planes=5 also four walls at +-10 m."""
     floor = Plane("floor", np.array([np.sin(slope), 0.0, np.cos(slope)]), 0.0)
     walls = [
-        Plane("wall", np.array([1.0, 0, 0]), -10.0),
-        Plane("wall", np.array([-1.0, 0, 0]), -10.0),
-        Plane("wall", np.array([0, 1.0, 0]), -10.0),
-        Plane("wall", np.array([0, -1.0, 0]), -10.0),
+        Plane("wall_0", np.array([1.0, 0, 0]), -10.0),
+        Plane("wall_1", np.array([-1.0, 0, 0]), -10.0),
+        Plane("wall_2", np.array([0, 1.0, 0]), -10.0),
+        Plane("wall_3", np.array([0, -1.0, 0]), -10.0),
     ]
     config = SiteConfig(
         friction=friction, drift_width=30.0, drift_length=100.0, void_depth=50.0, void_height=60.0
