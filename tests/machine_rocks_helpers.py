@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from drakerock.lhd.config import MachineConfig
@@ -62,7 +62,8 @@ class Scene:
         self.context = self.simulator.get_mutable_context()
         self.plant_context = self.plant.GetMyMutableContextFromRoot(self.context)
         set_machine_pose(self.plant, self.plant_context, self.machine, **pose)
-        self.simulator.Initialize()
+        # Heaps are strewn into the bucket at random: some rocks start inside its walls, and are pushed out.
+        self.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
 
     def step(self) -> None:
         self.simulator.AdvanceTo(self.context.get_time() + self.dynamics.time_step)

@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 import pytest
-from drakerock.rocks.drake.assembly import make_convex, make_pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydrake.geometry import FramePoseVector, GeometryFrame, GeometryInstance, ProximityProperties, SceneGraph
@@ -13,6 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from drakerock.resources import find_data
 from drakerock.rocks.contact_graph import find_contacts, find_loose
+from drakerock.rocks.drake.drift import make_convex
+from drakerock.rocks.drake.poses import make_pose
 from drakerock.rocks.state import PileState, load_pile
 
 GAP = 0.005
