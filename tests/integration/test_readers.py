@@ -22,8 +22,8 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 import yaml
-from drakerock.pile.config import SiteConfig
-from drakerock.pile.state import ContactMemory, PileState, load_pile, save_pile
+from drakerock.rocks.config import SiteConfig
+from drakerock.rocks.state import ContactMemory, PileState, load_pile, save_pile
 from drakerock.study.store import read_outcome, read_study
 
 from drakerock.errors import InputError
