@@ -24,7 +24,7 @@ import pytest
 import yaml
 from drakerock.rocks.config import SiteConfig
 from drakerock.rocks.state import ContactMemory, PileState, load_pile, save_pile
-from drakerock.study.store import read_outcome, read_study
+from drakerock.study.db import read_outcome, read_study
 
 from drakerock.errors import InputError
 from drakerock.exploration.problems import make_noisy_loading, make_noisy_table
