@@ -390,7 +390,7 @@ def test_surface_that_says_nothing_has_drakes_default_friction():
     """The friction of SceneGraphConfig, 0.5 if nobody sets it, is also the one that rocks meet."""
     world = finalized(World(surface=ProximityProperties()))
     lower, upper = np.full(3, -5.0), np.full(3, 5.0)
-    (floor,) = read_plant_geometry(world.plant, world.scene_graph, lower, upper).surroundings.half_spaces
+    (floor,) = read_plant_geometry(world.plant, world.scene_graph, lower, upper).surroundings.pieces
     assert floor.friction == 0.5
 
 
@@ -406,6 +406,18 @@ def test_momentum_is_kept_without_gravity():
     end = world.run(1.5)
     assert end.V_WRs[1, 3] > 0.1
     assert end.V_WRs[:, 3:].sum(axis=0) == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
+
+
+def test_rock_that_rests_moves_on_when_it_is_given_a_velocity():
+    world = finalized(World(surface=make_material(1e-4)))
+    rocks = world.add_rocks([[0.0, 0.0, 0.18]])
+    rest = world.run(1.2)
+    assert rocks.GetOutputPort("status").Eval(rocks.GetMyContextFromRoot(world.root)) == [1.0]
+    velocities = np.zeros((1, 6))
+    velocities[0, 3] = 2.0
+    rocks.set_pile(world.root, replace(rest, V_WRs=velocities))
+    world.simulator.AdvanceTo(1.5)
+    assert rocks.get_pile(world.root).p_WRs[0, 0] > 0.4
 
 
 def test_motor_connected_late_is_refused():
