@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
 
 from drakerock.lhd.placement import set_machine_pose
 from drakerock.loading.control import FeedforwardController
@@ -237,6 +238,20 @@ def test_rocks_that_are_nowhere_after_a_failure_are_left_where_they_were(small_s
     assert result.outcome.status == "failed"
     assert "failed to converge" in result.outcome.reason
     assert np.array_equal(result.pile_after.p_WRs, pile.p_WRs)
+
+
+def test_station_may_be_a_part_of_a_larger_diagram(small_scenario, pile):
+    station = make_station(small_scenario, pile)
+
+    def initialize(diagram):
+        root = diagram.CreateDefaultContext()
+        station.initialize(root)
+        return station.plant.GetPositions(station.plant.GetMyContextFromRoot(root)).copy()
+
+    alone = initialize(station.diagram)
+    builder = DiagramBuilder()
+    builder.AddSystem(station.diagram)
+    assert np.array_equal(initialize(builder.Build()), alone)
 
 
 def test_context_can_be_saved_and_repeated(small_scenario, pile):

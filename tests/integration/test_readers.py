@@ -22,9 +22,6 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 import yaml
-from drakerock.rocks.config import SiteConfig
-from drakerock.rocks.state import ContactMemory, PileState, load_pile, save_pile
-from drakerock.study.db import read_outcome, read_study
 
 from drakerock.errors import InputError
 from drakerock.exploration.problems import make_noisy_loading, make_noisy_table
@@ -34,7 +31,10 @@ from drakerock.loading.recording import Recording, Visual, load_recording, save_
 from drakerock.loading.scenario import load_scenario
 from drakerock.loading.signal_table import load_signals
 from drakerock.npz import save_arrays
+from drakerock.rocks.config import SiteConfig
+from drakerock.rocks.state import ContactMemory, PileState, load_pile, save_pile
 from drakerock.study.analysis import _read_confirmation
+from drakerock.study.db import read_outcome, read_study
 from drakerock.study.schema import load_study
 
 N_INPUTS = 220

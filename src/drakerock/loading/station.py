@@ -83,6 +83,8 @@ class Station:
     def initialize(self, root_context: Context) -> HeightField:
         """Put a context of the Diagram to the start of a loading: pile looked at, plan made, machine placed.
 
+        The context may be that of a larger Diagram that this one is a part of.
+
         Sensing and planning come first, since they tell where the machine starts; only a scanner's view depends on
         where it stands meanwhile. A Simulator's own initialisation afterwards keeps the plan.
 
@@ -93,13 +95,16 @@ class Station:
             InputError: the machine cannot reach its starting pose.
         """
         loading = self.scenario.loading
-        root_context.SetTimeStateAndParametersFrom(self.diagram.CreateDefaultContext())
+        # The Diagram may be a part of a larger one.
+        context = self.diagram.GetMyMutableContextFromRoot(root_context)
+        root_context.SetTime(0.0)
+        context.SetStateAndParametersFrom(self.diagram.CreateDefaultContext())
         self.rocks.set_pile(root_context, self.rocks.pile)
         self._place(root_context, x_tip=-loading.sensing.scanner.distance, y=0.0)
         for part in (self.sensor, self.planner):
             part.ExecuteInitializationEvents(part.GetMyMutableContextFromRoot(root_context))
-        field: HeightField = self.diagram.GetOutputPort("height_field").Eval(root_context)
-        plan = self.diagram.GetOutputPort("plan").Eval(root_context)
+        field: HeightField = self.diagram.GetOutputPort("height_field").Eval(context)
+        plan = self.diagram.GetOutputPort("plan").Eval(context)
         if isinstance(plan, DigPlan):
             self._place(root_context, x_tip=float(plan.waypoint_x[0]) - loading.planning.run_up, y=plan.y)
         return field

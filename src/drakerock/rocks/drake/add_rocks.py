@@ -98,10 +98,14 @@ def AddRocks(
         builder.Connect(plant.get_body_poses_output_port(), rocks.GetInputPort("body_poses"))
         return rocks
     settings = engine or NonsmoothConfig()
+    gravity = plant.gravity_field().gravity_vector()
+    if not gravity.any():
+        # Rocks that float rest on nothing: one asleep would take a blow like a wall.
+        settings = settings.model_copy(update={"reduction": "none"})
     shapes = shapes or load_rock_shapes(config.shapes, config.max_corners)
     solver = NonsmoothEngine(
         config, shapes, geometry.surroundings, settings, plant.time_step(), pile.shape, pile.size, pile.fixed,
-        geometry.pieces, len(geometry.bodies), plant.gravity_field().gravity_vector(),
+        geometry.pieces, len(geometry.bodies), gravity,
     )  # fmt: skip
     rocks = builder.AddSystem(NonsmoothRocks(plant, solver, pile, shapes, geometry))
     if visible:
@@ -121,7 +125,7 @@ def AddRocks(
 
 
 def _require_usable(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
-    if builder.HasSubsystemNamed("rocks"):
+    if any(isinstance(system, RockSystem) for system in builder.GetSystems()):
         raise InputError(
             "AddRocks: the Diagram has rocks already; add them once, as one pile (PileState.join)"
         )
@@ -211,7 +215,7 @@ def _occupy(builder: DiagramBuilder, plant: MultibodyPlant, port: InputPort) -> 
             f"AddRocks: nothing is connected to the plant's port '{name}', which its motors with gains need; connect "
             "what drives them first, and call AddRocks after"
         )
-    if name in ("actuation", "applied_generalized_force") and port.size():
+    if port.size():
         builder.Connect(
             builder.AddSystem(ConstantVectorSource(np.zeros(port.size()))).get_output_port(), port
         )

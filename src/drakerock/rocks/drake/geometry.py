@@ -18,7 +18,6 @@ from pydrake.geometry import (
     HalfSpace,
     Mesh,
     SceneGraph,
-    SceneGraphConfig,
     SceneGraphInspector,
     Shape,
     Sphere,
@@ -33,9 +32,6 @@ from drakerock.rocks.engine.engine import MachinePiece
 
 Array = NDArray[np.float64]
 
-# SceneGraph's defaults for what says nothing of its material: point stiffness [N/m], friction.
-POINT_STIFFNESS = SceneGraphConfig().default_proximity_properties.point_stiffness
-FRICTION = SceneGraphConfig().default_proximity_properties.dynamic_friction
 # A mesh whose hull has so much more volume than the mesh itself is not convex.
 CONVEXITY_TOLERANCE = 0.01
 # Corners around a cylinder, an ellipsoid's rings, and where along its y axis these are [half axes].
@@ -50,10 +46,14 @@ class Material:
     Attributes:
         friction: its dynamic Coulomb coefficient.
         stiffness: of its point contacts, in series with the other body's [N/m].
+        dissipation: Hunt and Crossley's [s/m].
+        relaxation_time: that SAP has in place of dissipation [s].
     """
 
     friction: float
     stiffness: float
+    dissipation: float
+    relaxation_time: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +109,10 @@ def read_plant_geometry(
     Raises:
         InputError: a shape that is not supported, or a body without mass; the message names the body.
     """
-    inspector = scene_graph.model_inspector()
-    context = plant.CreateDefaultContext()
+    scene_context, context = scene_graph.CreateDefaultContext(), plant.CreateDefaultContext()
+    # A context's geometry has SceneGraph's default material where it has none of its own; the model's has not.
+    query = scene_graph.get_query_output_port().Eval(scene_context)
+    inspector = query.inspector()
     static_bodies = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
     half_spaces: list[surroundings.HalfSpace] = []
     static: list[surroundings.StaticPiece] = []
@@ -148,7 +150,9 @@ def read_body_pieces(
 ) -> list[ConvexPiece]:
     """Return a body's proximity geometries as convex pieces in its frame; arguments and errors as above."""
     geometries = [g for g in plant.GetCollisionGeometriesForBody(body) if g not in ignored]
-    return list(_read_pieces(scene_graph.model_inspector(), body, geometries))
+    context = scene_graph.CreateDefaultContext()
+    query = scene_graph.get_query_output_port().Eval(context)
+    return list(_read_pieces(query.inspector(), body, geometries))
 
 
 def _read_pieces(
@@ -185,13 +189,14 @@ def _read_static(
 
 
 def read_material(inspector: SceneGraphInspector, geometry: GeometryId) -> Material:
-    """Return what a proximity geometry's surface is like."""
+    """Return what a proximity geometry's surface is like; the inspector is of a context, which has all defaults."""
     properties = inspector.GetProximityProperties(geometry)
-    friction = properties.GetPropertyOrDefault(
-        "material", "coulomb_friction", CoulombFriction(FRICTION, FRICTION)
+    friction: CoulombFriction = properties.GetProperty("material", "coulomb_friction")
+    numbers = ("point_contact_stiffness", "hunt_crossley_dissipation", "relaxation_time")
+    return Material(
+        float(friction.dynamic_friction()),
+        *(float(properties.GetProperty("material", name)) for name in numbers),
     )
-    stiffness = properties.GetPropertyOrDefault("material", "point_contact_stiffness", POINT_STIFFNESS)
-    return Material(float(friction.dynamic_friction()), float(stiffness))
 
 
 def _require_mass(plant: MultibodyPlant, body: RigidBody) -> None:

@@ -7,10 +7,10 @@ In one step of length h the plant's generalised velocities v obey
 with gravity, force elements, actuation and the applied forces of others in tau, the rocks' spatial forces F_k on its
 bodies, and one row g_r per motor, joint stop and contact of the plant's own, each with a law
 g_r v' + s_r lambda_r = b_r,  lower <= lambda_r <= upper. The laws are those that Drake's discrete solver uses: a
-motor with velocity gain d has s = 1 / (h d) and its effort limit as bounds, a point contact of stiffness k has
-s = 1 / (h^2 k). So the rocks feel a robot's inertia, its motors until they saturate, and its tyres until they slip,
-in the same step. The plant itself is then advanced with the rocks' forces, by its own solver; nothing of its motion is
-decided here.
+motor with velocity gain d has s = 1 / (h d) and its effort limit as bounds, a point contact of stiffness k without
+dissipation has s = 1 / (h^2 k). So the rocks feel a robot's inertia, its motors until they saturate, and its tyres
+until they slip, in the same step. The plant itself is then advanced with the rocks' forces, by its own solver; nothing
+of its motion is decided here.
 """
 
 from __future__ import annotations
@@ -23,7 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.geometry import GeometryId, QueryObject
-from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
+from pydrake.multibody.plant import (
+    DiscreteContactApproximation,
+    ExternallyAppliedSpatialForce,
+    MultibodyPlant,
+)
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, ModelInstanceIndex, MultibodyForces
 from pydrake.systems.framework import Context, InputPort, LeafSystem, ValueProducer
 
@@ -31,6 +35,7 @@ from drakerock.errors import InputError, SimulationFailure
 from drakerock.memory import weak
 from drakerock.rocks.drake.ball_constraints import BallConstraint, read_ball_constraints
 from drakerock.rocks.drake.geometry import Material, read_material
+from drakerock.rocks.drake.touches import Touch, find_touches
 from drakerock.rocks.engine.engine import MachineStep, make_machineless_step
 from drakerock.rocks.engine.machine_step import (
     JOINT_WIDTH,
@@ -273,27 +278,37 @@ class PlantView(LeafSystem):
     def _find_own_contacts(self, query: QueryObject) -> list[list[float]]:
         """Return the contacts among the plant's bodies and with the world, tyres on the floor above all."""
         contacts = []
-        for pair in query.ComputePointPairPenetration():
-            body_A, of_A = self._find_material(query, pair.id_A)
-            body_B, of_B = self._find_material(query, pair.id_B)
-            if (body_A is None and body_B is None) or not pair.depth > 0.0:
+        for touch in find_touches(self._plant, query):
+            body_A, of_A = self._find_material(query, touch.id_A)
+            body_B, of_B = self._find_material(query, touch.id_B)
+            if (body_A is None and body_B is None) or not touch.depth > 0.0:
                 continue
-            # nhat_BA_W points out of B into A
             number, other, sign = (body_A, body_B, 1.0) if body_A is not None else (body_B, None, -1.0)
             assert number is not None
-            sides = zip(pair.p_WCa.tolist(), pair.p_WCb.tolist(), strict=True)
+            in_series = of_A.stiffness * of_B.stiffness / (of_A.stiffness + of_B.stiffness)
             contacts.append(
                 [
                     number,
-                    *(sign * part for part in pair.nhat_BA_W.tolist()),
-                    *(0.5 * (a + b) for a, b in sides),
-                    pair.depth,
-                    of_A.stiffness * of_B.stiffness / (of_A.stiffness + of_B.stiffness),
+                    *(sign * part for part in touch.normal),
+                    *touch.point,
+                    touch.depth,
+                    in_series if touch.stiffness is None else touch.stiffness,
                     max(calc_pair_friction(of_A.friction, of_B.friction), SMOOTH),
                     NO_BODY if other is None else other,
+                    self._calc_damping_time(touch, of_A, of_B),
                 ]
             )
         return contacts
+
+    def _calc_damping_time(self, touch: Touch, of_A: Material, of_B: Material) -> float:
+        """Return what stands beside the time step in Drake's normal law [s]."""
+        if self._plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kSap:
+            return of_A.relaxation_time + of_B.relaxation_time
+        # The softer side's counts more.
+        share = touch.share_A
+        if share is None:
+            share = of_B.stiffness / (of_A.stiffness + of_B.stiffness)
+        return touch.depth * (share * of_A.dissipation + (1.0 - share) * of_B.dissipation)
 
     def _find_material(self, query: QueryObject, geometry: GeometryId) -> tuple[int | None, Material]:
         """Return a geometry's body number (None: at rest) and its material."""

@@ -250,7 +250,8 @@ class NonsmoothEngine:
     # ---- state in and out
 
     def make_arrays(self, pile: PileState) -> RockArrays:
-        """Return the state arrays of a pile; rocks that are marked as resting in its contacts stay asleep.
+        """Return the state arrays of a pile; rocks that are marked as resting in its contacts stay asleep,
+        unless they have been given a velocity.
 
         Raises:
             ValueError: not the rocks this engine was made for.
@@ -271,7 +272,8 @@ class NonsmoothEngine:
         if pile.contacts is not None:
             cache = self._make_cache(pile.contacts)
             if self.config.reduction == "rest":
-                asleep = pile.contacts.resting & ~self.fixed
+                still = (np.abs(pile.V_WRs) < self.config.rest.speed).all(axis=1)
+                asleep = pile.contacts.resting & still & ~self.fixed
                 sleep["status"][asleep] = SLEEPING
                 sums = np.zeros((n, 3))
                 contact_cache.sum_impulses(cache, n, sums)

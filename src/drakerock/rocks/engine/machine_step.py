@@ -139,8 +139,10 @@ def _set_site_rows(
         if contact.other != NO_BODY:
             _subtract_other(contact, jacobian, origins, axis, rows[first + k])
     depth, stiffness, mu = contact.depth, contact.stiffness, contact.friction
-    values[first].target = depth / time_step
-    values[first].compliance = 1.0 / (time_step * time_step * stiffness)
+    # The law h k (depth - (h + damping time) v): Drake's about v = 0, where bodies rest.
+    slowness = time_step + contact.damping_time
+    values[first].target = depth / slowness
+    values[first].compliance = 1.0 / (time_step * slowness * stiffness)
     values[first].upper = np.inf
     for k in range(first + 1, first + 3):
         # Drake's regularised friction is full at the stiction tolerance.

@@ -93,6 +93,7 @@ SITE_CONTACT = np.dtype(
         ("stiffness", float),  # [N/m]
         ("friction", float),  # coefficient
         ("other", float),  # the other body, NO_BODY: the world
+        ("damping_time", float),  # by which dissipation slows it, beside the time step [s]
     ]
 )
 NO_BODY = -1

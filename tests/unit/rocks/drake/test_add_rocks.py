@@ -9,7 +9,9 @@ import pytest
 import trimesh
 from pydrake.common.value import Value
 from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
     AddContactMaterial,
+    AddRigidHydroelasticProperties,
     Box,
     HalfSpace,
     Mesh,
@@ -23,10 +25,11 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import (
-    AddMultibodyPlantSceneGraph,
+    AddMultibodyPlant,
     CoulombFriction,
     ExternallyAppliedSpatialForce,
     MultibodyPlant,
+    MultibodyPlantConfig,
 )
 from pydrake.multibody.tree import PdControllerGains, PrismaticJoint, SpatialInertia
 from pydrake.systems.analysis import Simulator
@@ -60,11 +63,17 @@ ROUGH = make_material(1.0)
 class World:
     """A plant with a floor, and rocks of 0.4 m at given places."""
 
-    def __init__(self, time_step: float = 0.01, floor: bool = True) -> None:
+    def __init__(
+        self, time_step: float = 0.01, floor: bool = True, surface: ProximityProperties = ROUGH, **options
+    ) -> None:
         self.builder = DiagramBuilder()
-        self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(self.builder, time_step)
+        self.plant, self.scene_graph = AddMultibodyPlant(
+            MultibodyPlantConfig(time_step=time_step, **options), self.builder
+        )
         if floor:
-            self.add_geometry("floor", Box(20.0, 20.0, 1.0), [0.0, 0.0, -0.5], self.plant.world_body())
+            self.add_geometry(
+                "floor", Box(20.0, 20.0, 1.0), [0.0, 0.0, -0.5], self.plant.world_body(), surface
+            )
 
     def add_geometry(self, name, shape, p, body, friction=ROUGH):
         return self.plant.RegisterCollisionGeometry(body, RigidTransform(p), shape, name, friction)
@@ -344,6 +353,84 @@ def test_bodies_that_touch_each_other_carry_a_rock_together(friction):
     assert F_B_W[5] == pytest.approx(-mass * 9.81, rel=0.05)
     assert 1.0 < end.p_WRs[0, 2] < 1.3
     assert world.read_pose(upper)[2] == pytest.approx(0.75, abs=0.01)
+
+
+def make_soft(compliant: bool) -> ProximityProperties:
+    properties = make_material(1.0)
+    if compliant:
+        AddCompliantHydroelasticProperties(0.1, 1e6, properties)
+    else:
+        AddRigidHydroelasticProperties(0.5, properties)
+    return properties
+
+
+@pytest.mark.parametrize("approximation", ["sap", "lagged", "similar"])
+@pytest.mark.parametrize("surface", ["default", "soft on rigid", "soft on soft"])
+def test_rocks_foresee_what_drakes_contact_laws_do(approximation, surface):
+    """A block on the floor is pressed by a rock: its coming velocity is foreseen whatever its surface is like."""
+    floor, block = ProximityProperties(), ProximityProperties()
+    if surface != "default":
+        floor, block = make_soft(compliant=surface == "soft on soft"), make_soft(compliant=True)
+    world = World(surface=floor, discrete_contact_approximation=approximation)
+    body = world.add_body("block", Box(1.0, 1.0, 0.5), mass=300.0, rail=[0.0, 0.0, 1.0], friction=block)
+    world.plant.GetJointByName("block_rail").set_default_translation(0.25)
+    finalized(world)
+    rocks = world.add_rocks([[0.0, 0.0, 0.8]])
+    world.run(1.5)
+    mass = world.pile.calc_masses(np.array([shape.volume for shape in rocks.shapes]), 2500.0)[0]
+    F_B_W = rocks.get_body_force_output_port(body.index()).Eval(rocks.GetMyContextFromRoot(world.root))
+    assert F_B_W[5] == pytest.approx(-mass * 9.81, rel=0.01)
+    foreseen = rocks.get_report(world.root).machine_velocity
+    world.simulator.AdvanceTo(1.51)
+    velocity = world.plant.GetVelocities(world.plant.GetMyContextFromRoot(world.root))
+    assert np.allclose(foreseen, velocity, atol=1e-3)
+
+
+def test_surface_that_says_nothing_has_drakes_default_friction():
+    """The friction of SceneGraphConfig, 0.5 if nobody sets it, is also the one that rocks meet."""
+    world = finalized(World(surface=ProximityProperties()))
+    lower, upper = np.full(3, -5.0), np.full(3, 5.0)
+    (floor,) = read_plant_geometry(world.plant, world.scene_graph, lower, upper).surroundings.pieces
+    assert floor.friction == 0.5
+
+
+def test_momentum_is_kept_without_gravity():
+    """Nothing rests in free fall: no rock is asleep and takes a blow like a wall."""
+    world = World(floor=False)
+    world.plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
+    finalized(world)
+    velocities = np.zeros((2, 6))
+    velocities[0, 3] = 1.0
+    pile = make_pile([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], size=[0.4, 0.4], velocities=velocities)
+    world.rocks = AddRocks(world.builder, world.plant, world.scene_graph, pile)
+    end = world.run(1.5)
+    assert end.V_WRs[1, 3] > 0.1
+    assert end.V_WRs[:, 3:].sum(axis=0) == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
+
+
+def test_rock_that_rests_moves_on_when_it_is_given_a_velocity():
+    world = finalized(World(surface=make_material(1e-4)))
+    rocks = world.add_rocks([[0.0, 0.0, 0.18]])
+    rest = world.run(1.2)
+    assert rocks.GetOutputPort("status").Eval(rocks.GetMyContextFromRoot(world.root)) == [1.0]
+    velocities = np.zeros((1, 6))
+    velocities[0, 3] = 2.0
+    rocks.set_pile(world.root, replace(rest, V_WRs=velocities))
+    world.simulator.AdvanceTo(1.5)
+    assert rocks.get_pile(world.root).p_WRs[0, 0] > 0.4
+
+
+def test_motor_connected_late_is_refused():
+    """Rocks would not feel it; Drake ends the process where a port is connected twice, so only look."""
+    world = World()
+    plough = world.add_body("plough", Box(0.5, 0.5, 0.5), rail=[1.0, 0.0, 0.0])
+    finalized(world).add_rocks([[3.0, 0.0, 0.3]])
+    for port in (
+        world.plant.get_actuation_input_port(),
+        world.plant.get_actuation_input_port(plough.model_instance()),
+        world.plant.get_applied_generalized_force_input_port(),
+    ):
+        assert world.builder.IsConnectedOrExported(port)
 
 
 def test_second_source_of_geometry_in_the_scene_graph():

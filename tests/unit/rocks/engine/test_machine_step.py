@@ -76,8 +76,8 @@ def test_rows_measure_joints_and_points_on_the_site(rng, inertia, jacobian):
     inverse, origins, velocity = np.linalg.inv(inertia), rng.normal(size=(N_BODIES, 3)), rng.normal(size=N_V)
     joints = np.array([[4, 1.0, 0.3, 1e-3, -5.0, 6.0], [7, -1.0, -0.2, 0.0, 0.0, np.inf]])
     normal, point = np.array([0.6, 0.0, 0.8]), np.array([0.3, -1.0, 0.2])
-    depth, stiffness, mu, tolerance = 2e-3, 5e6, 0.7, 1e-3
-    contact = np.array([[1, *normal, *point, depth, stiffness, mu, NO_BODY]])
+    depth, stiffness, mu, tolerance, damping_time = 2e-3, 5e6, 0.7, 1e-3, 0.03
+    contact = np.array([[1, *normal, *point, depth, stiffness, mu, NO_BODY, damping_time]])
     arrays = make_machine_arrays(inverse, jacobian, origins, joints, contact, tolerance, H)
 
     measured = arrays.rows @ velocity
@@ -90,7 +90,10 @@ def test_rows_measure_joints_and_points_on_the_site(rng, inertia, jacobian):
     values = arrays.row_values
     law = ["target", "compliance", "lower", "upper"]
     assert values[:2][law].tolist() == [tuple(joint) for joint in joints[:, 2:]]
-    assert values[2][law].tolist() == pytest.approx((depth / H, 1.0 / (H * H * stiffness), 0.0, np.inf))
+    slowness = H + damping_time
+    assert values[2][law].tolist() == pytest.approx(
+        (depth / slowness, 1.0 / (H * slowness * stiffness), 0.0, np.inf)
+    )
     # Full friction, mu times the load of the penetration, at the stiction tolerance.
     for row in values[3:5]:
         assert row["compliance"] * mu * H * stiffness * depth == pytest.approx(tolerance)
@@ -104,7 +107,7 @@ def test_rows_measure_joints_and_points_on_the_site(rng, inertia, jacobian):
 def test_a_contact_of_two_bodies_measures_one_against_the_other(rng, inertia, jacobian):
     inverse, origins, velocity = np.linalg.inv(inertia), rng.normal(size=(N_BODIES, 3)), rng.normal(size=N_V)
     normal, point = np.array([0.6, 0.0, 0.8]), np.array([0.3, -1.0, 0.2])
-    contact = np.array([[1, *normal, *point, 2e-3, 5e6, 0.7, 2]])
+    contact = np.array([[1, *normal, *point, 2e-3, 5e6, 0.7, 2, 0.0]])
     arrays = make_machine_arrays(inverse, jacobian, origins, np.zeros((0, JOINT_WIDTH)), contact, 1e-3, H)
     V_WBs = [jacobian[b] @ velocity for b in (1, 2)]
     speeds = [V[3:] + np.cross(V[:3], point - origins[b]) for V, b in zip(V_WBs, (1, 2), strict=True)]
