@@ -490,7 +490,7 @@ def _print_outcome(outcome: Any) -> None:
     )
     table.add_row(
         "cost",
-        f"{outcome.wall_time_s:.1f} s for {outcome.sim_time_s:.1f} s, {outcome.ms_per_step:.1f} ms per step",
+        f"{outcome.wall_time_s:.1f} s for {outcome.sim_time_s:.1f} s, {outcome.ms_per_step:.1f} CPU ms per step",
     )
     output.print(table)
 

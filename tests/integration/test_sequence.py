@@ -15,7 +15,7 @@ N = 3
 
 def strip(outcomes):
     return [
-        {k: v for k, v in asdict(item).items() if k not in ("wall_time_s", "ms_per_step")}
+        {k: v for k, v in asdict(item).items() if k not in ("wall_time_s", "cpu_time_s", "ms_per_step")}
         for item in outcomes
     ]
 
