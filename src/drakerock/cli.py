@@ -441,7 +441,9 @@ def _load(path: Path | None, seed: int | None, overrides: list[str] | None) -> A
 def _show_progress(name: str) -> Iterator[Callable[..., None]]:
     """Show what is being done on standard error; plain (and silent) when that is not a terminal."""
     columns = (TextColumn("[bold]{task.fields[stage]:<18}"), BarColumn(), TextColumn("{task.fields[note]}"))
-    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
+    with Progress(
+        *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
+    ) as progress:
         task = progress.add_task(name, total=None, stage=name, note="")
 
         def advance(stage: str, share: float | None = None, note: str = "") -> None:
