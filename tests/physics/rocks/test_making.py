@@ -94,7 +94,7 @@ def test_same_recipe_same_bits_made_or_from_the_cache(pile, recipe, tmp_path, mo
             assert np.array_equal(getattr(other.contacts, name), getattr(pile.contacts, name)), name
     assert cached.provenance["recipe"] == calc_config_hash(recipe)
     assert cached.provenance["seed"] == 3
-    assert set(cached.provenance["versions"]) == {"drakerock", "drake", "numba", "numpy"}
+    assert set(cached.provenance["versions"]) == {"results", "drakerock", "drake", "numba", "numpy"}
     # A stored pile goes on as one that never was.
     shapes = load_rock_shapes(recipe.rocks.shapes)
     one, _ = settle(pile, shapes, recipe, 0.3)
