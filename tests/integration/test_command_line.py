@@ -224,7 +224,7 @@ def test_pile_command(place, loaded):
             ["load", "small.yaml", "--set", "machine.model=nothing.sdf"],
             ["machine.model", "nothing.sdf", "no such file"],
         ),
-        (["load", "small.yaml", "--set", "machine.model=broken.sdf"], ["broken.sdf:2", "no valid XML"]),
+        (["load", "small.yaml", "--set", "machine.model=broken.sdf"], ["broken.sdf:1", "no valid XML"]),
         (["load", "small.yaml", "--set", "pile.source=nothing.npz"], ["nothing.npz", "no such file"]),
         (["load", "small.yaml", "--set", "pile.source=broken.npz"], ["broken.npz", "not a readable"]),
         (["load", "small.yaml", "--set", "rocks.shapes=[broken.sdf]"], ["rocks.shapes", "broken.sdf"]),

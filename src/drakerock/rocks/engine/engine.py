@@ -431,11 +431,12 @@ class NonsmoothEngine:
         """Return the contact points that carry load in the coming step; arguments and errors as of `step`."""
         _, report = self.step(arrays, machine)
         rows, n_rows = self.detection.rows, report.n_contacts
-        loaded = rows.values["impulse"][:n_rows, 0] > 0.0
+        impacts = self._impacts[:n_rows] if report.has_impacts else np.zeros((n_rows, 3))
+        loaded = (rows.values["impulse"][:n_rows, 0] > 0.0) | impacts.any(axis=1)
         values, keys = rows.values[:n_rows][loaded], rows.key[:n_rows][loaded]
         first, second = keys // KEY_STEP, keys % KEY_STEP
         axes = np.stack([values["normal"], values["tangent_1"], values["tangent_2"]], axis=1)
-        impulses = np.einsum("kij,ki->kj", axes, values["impulse"])
+        impulses = np.einsum("kij,ki->kj", axes, values["impulse"]) + impacts[loaded]
         # A row's arms are from where the bodies were when the step began.
         points = arrays.positions[first] + values["arm_a"]
         return ContactTable(first, second, points, impulses, values["gap"].copy())
@@ -514,6 +515,7 @@ class NonsmoothEngine:
             flagged=max_penetration > self.config.max_penetration,
             overflow=n_points - len(new.cache.pairs),
             n_distances=int(self.detection.statistics[1]),
+            has_impacts=solution.has_impacts,
         )  # fmt: skip
         return new, report
 

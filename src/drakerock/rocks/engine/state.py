@@ -139,6 +139,7 @@ class StepReport:
         flagged: it had to be redone, or penetration is beyond the bound of the settings.
         overflow: loaded points that the cache could not take.
         n_distances: pairs whose distance was computed, the others moved together or were known to be apart.
+        has_impacts: some contacts were impacts, whose impulses come on top of those of the resting stage.
     """
 
     F_Bs_W: Array
@@ -160,6 +161,7 @@ class StepReport:
     flagged: bool
     overflow: int
     n_distances: int
+    has_impacts: bool
 
     @property
     def n_awake(self) -> int:
