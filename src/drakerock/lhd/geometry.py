@@ -93,5 +93,5 @@ def collision_pieces(
     """
     pads = find_pads(plant, scene_graph, machine)
     bodies = [plant.get_body(index) for index in plant.GetBodyIndices(machine.instance)]
-    pieces = {body.name(): read_body_pieces(plant, scene_graph, body, pads) for body in bodies}
-    return {name: found for name, found in pieces.items() if found}
+    pieces = read_body_pieces(plant, scene_graph, bodies, pads)
+    return {body.name(): found for body, found in zip(bodies, pieces, strict=True) if found}

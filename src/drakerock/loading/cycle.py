@@ -185,10 +185,10 @@ class _Cycle:
         assert self.t4 is not None
         limits = self._station.scenario.loading.performance
         scale = Scale(self._station)
-        weighed_from = self.t4 + limits.weighing_delay
+        t4 = self.t4
 
         def weigh(root_context: Context) -> EventStatus:
-            if 0.0 <= root_context.get_time() - weighed_from <= limits.weighing_time:
+            if 0.0 <= root_context.get_time() - t4 - limits.weighing_delay <= limits.weighing_time:
                 scale.add(root_context)
             return EventStatus.DidNothing()
 

@@ -6,13 +6,8 @@ A part is a System with ports of known names; the station connects what it has. 
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from types import ModuleType
 
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
@@ -23,6 +18,7 @@ from drakerock.lhd.model import Machine
 from drakerock.loading.config import PartConfig
 from drakerock.loading.planning import DiggingMachine
 from drakerock.loading.scenario import Scenario
+from drakerock.modules import import_named
 from drakerock.rocks.shapes import RockShape
 
 OUTPUTS = {"controller": "motor_speeds", "planner": "plan", "sensor": "height_field"}
@@ -96,25 +92,13 @@ def load_function(name: str, where: str) -> MakePart:
     """
     module_name, _, function = name.rpartition(":")
     try:
-        module = _load_file(Path(module_name)) if module_name.endswith(".py") else None
-        module = module or importlib.import_module(module_name)
+        module = import_named(module_name)
     except Exception as error:
         raise InputError(f"{where}: {module_name} cannot be imported: {error}") from error
     found = getattr(module, function, None)
     if not callable(found):
         raise InputError(f"{where}: {module_name} has no function '{function}'")
     return found
-
-
-def _load_file(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"drakerock part {path}", path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise FileNotFoundError("no such file")
-    module = importlib.util.module_from_spec(spec)
-    # Dataclasses look their module up by its name.
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def connect_inputs(

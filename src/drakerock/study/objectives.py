@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import difflib
-import importlib
-import importlib.util
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 from drakerock.errors import InputError
 from drakerock.exploration.problem import MAX_MAGNITUDE, Objective
 from drakerock.loading.outcome import CycleOutcome
+from drakerock.modules import import_named
 
 ObjectiveFunction = Callable[[CycleOutcome], float | None]
 """From the outcome of a finished cycle to the objective in its natural sense.
@@ -101,13 +99,7 @@ def import_module(name: str) -> None:
         InputError: it is not there or cannot be imported.
     """
     try:
-        if name.endswith(".py"):
-            spec = importlib.util.spec_from_file_location(Path(name).stem, name)
-            if spec is None or spec.loader is None:
-                raise ImportError("not a Python file")
-            spec.loader.exec_module(importlib.util.module_from_spec(spec))
-        else:
-            importlib.import_module(name)
+        import_named(name)
     except Exception as error:  # whatever a user's module dies of
         raise InputError(f"modules: {name}: cannot be imported: {type(error).__name__}: {error}") from error
 

@@ -13,7 +13,12 @@ from drakerock.config import parse_config
 from drakerock.errors import InputError
 from drakerock.exploration.problem import Objective
 from drakerock.exploration.table import ResponseTable
-from drakerock.study.objectives import RegisteredObjective, get_objective, register_objective
+from drakerock.study.objectives import (
+    RegisteredObjective,
+    get_objective,
+    import_module,
+    register_objective,
+)
 from drakerock.study.resimulation import Resimulation
 from drakerock.study.runner import run_study
 from drakerock.study.schema import StudyConfig
@@ -109,3 +114,18 @@ def test_an_empty_bucket_takes_the_worst_energy():
     assert item.evaluate(Outcome) == item.objective.worst
     Outcome.bucket_mass_kg = None
     assert math.isnan(item.evaluate(Outcome))
+
+
+def test_a_module_of_ones_own_may_hold_dataclasses_with_postponed_annotations(tmp_path):
+    """They look their module up by its name, which a file loaded by its path does not have by itself."""
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "from __future__ import annotations\nfrom dataclasses import dataclass\n\n"
+        "from drakerock.exploration.problem import Objective\n"
+        "from drakerock.study.objectives import register_objective\n\n\n"
+        "@dataclass\nclass Scale:\n    factor: float = 2.0\n\n\n"
+        '@register_objective(Objective(name="twice the load", meaning="for a test"))\n'
+        "def calc(outcome):\n    return Scale().factor * outcome.bucket_mass_kg\n"
+    )
+    import_module(str(path))
+    assert get_objective("twice the load").objective.meaning == "for a test"

@@ -101,7 +101,7 @@ def AddRocks(
     gravity = plant.gravity_field().gravity_vector()
     if not gravity.any():
         # Rocks that float rest on nothing: one asleep would take a blow like a wall.
-        settings = settings.model_copy(update={"reduction": "none"})
+        settings = settings.replace(reduction="none")
     shapes = shapes or load_rock_shapes(config.shapes, config.max_corners)
     solver = NonsmoothEngine(
         config, shapes, geometry.surroundings, settings, plant.time_step(), pile.shape, pile.size, pile.fixed,
@@ -185,8 +185,6 @@ def _connect_view(builder: DiagramBuilder, plant: MultibodyPlant, view: PlantVie
     builder.Connect(plant.get_state_output_port(), view.GetInputPort("state"))
     builder.ConnectToSame(plant.get_geometry_query_input_port(), view.GetInputPort("geometry_query"))
     for port in _find_driving_ports(plant):
-        if not view.HasInputPort(port.get_name()):
-            continue
         if not builder.ConnectToSame(port, view.GetInputPort(port.get_name())):
             _occupy(builder, plant, port)
 

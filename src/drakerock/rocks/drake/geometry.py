@@ -146,13 +146,20 @@ def read_plant_geometry(
 
 
 def read_body_pieces(
-    plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody, ignored: Sequence[GeometryId] = ()
-) -> list[ConvexPiece]:
-    """Return a body's proximity geometries as convex pieces in its frame; arguments and errors as above."""
-    geometries = [g for g in plant.GetCollisionGeometriesForBody(body) if g not in ignored]
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    bodies: Sequence[RigidBody],
+    ignored: Sequence[GeometryId] = (),
+) -> list[list[ConvexPiece]]:
+    """Return each body's proximity geometries as convex pieces in its frame; arguments and errors as above."""
     context = scene_graph.CreateDefaultContext()
     query = scene_graph.get_query_output_port().Eval(context)
-    return list(_read_pieces(query.inspector(), body, geometries))
+    geometries = [
+        [g for g in plant.GetCollisionGeometriesForBody(body) if g not in ignored] for body in bodies
+    ]
+    return [
+        list(_read_pieces(query.inspector(), body, own)) for body, own in zip(bodies, geometries, strict=True)
+    ]
 
 
 def _read_pieces(

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
@@ -16,6 +15,7 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, OutputPort
 
 from drakerock.memory import weak
+from drakerock.rocks.drake.poses import make_poses
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.state import PileState, make_empty_pile
 
@@ -171,9 +171,7 @@ class RockSystem(LeafSystem):
 
     def _calc_poses(self, context: Context, output: Value) -> None:
         pile = self._read_pile(context)
-        output.set_value(
-            [RigidTransform(Quaternion(q), p) for q, p in zip(pile.q_WRs, pile.p_WRs, strict=True)]
-        )
+        output.set_value(make_poses(pile.q_WRs, pile.p_WRs))
 
     def _calc_summary(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._read_report(context)[: len(ROCK_SUMMARY)])

@@ -19,11 +19,11 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, ValueProducer
-from scipy.spatial.transform import Rotation
 
 from drakerock.memory import weak
 from drakerock.rocks.drake.drift import make_convex, make_looks
 from drakerock.rocks.drake.interface import RockSystem
+from drakerock.rocks.drake.poses import make_poses
 from drakerock.rocks.state import PileState, make_empty_pile
 
 ROCK_COLOR = (0.55, 0.47, 0.38, 1.0)
@@ -74,14 +74,12 @@ class RockPoses(LeafSystem):
         poses = np.hstack([pile.q_WRs, pile.p_WRs])[self._rocks]
         vector = output.get_mutable_value()
         stale = (
-            np.flatnonzero((poses != shown).any(axis=1)) if vector.size() == len(poses) else range(len(poses))
+            np.flatnonzero((poses != shown).any(axis=1))
+            if vector.size() == len(poses)
+            else np.arange(len(poses))
         )
-        matrices = np.zeros((len(poses), 3, 4))
-        if len(poses):
-            matrices[:, :, :3] = Rotation.from_quat(poses[:, :4], scalar_first=True).as_matrix()
-            matrices[:, :, 3] = poses[:, 4:]
-        for k in stale:
-            vector.set_value(self._frames[k], RigidTransform(matrices[k]))
+        for k, X_WR in zip(stale, make_poses(poses[stale, :4], poses[stale, 4:]), strict=True):
+            vector.set_value(self._frames[k], X_WR)
         shown[:] = poses
 
 
@@ -105,14 +103,11 @@ def register_rocks(
         for k, s in {(int(k), float(s)) for k, s in zip(pile.shape, pile.size, strict=True)}
     }
     illustration = {fixed: make_illustration(fixed) for fixed in (False, True)}
-    X_WRs = np.zeros((len(pile), 3, 4))
-    if len(pile):
-        X_WRs[:, :, :3] = Rotation.from_quat(pile.q_WRs, scalar_first=True).as_matrix()
-        X_WRs[:, :, 3] = pile.p_WRs
+    X_WRs = make_poses(pile.q_WRs, pile.p_WRs)
     frames: dict[int, FrameId] = {}
     for rock in range(len(pile)):
         fixed, name = bool(pile.fixed[rock]), f"rock_{rock}"
-        X = RigidTransform(X_WRs[rock]) if fixed else RigidTransform()
+        X = X_WRs[rock] if fixed else RigidTransform()
         instance = GeometryInstance(X, convex[int(pile.shape[rock]), float(pile.size[rock])], name)
         instance.set_illustration_properties(illustration[fixed])
         instance.set_perception_properties(make_perception(rock, fixed))
