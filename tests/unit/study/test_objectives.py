@@ -124,8 +124,8 @@ def test_a_module_of_ones_own_may_hold_dataclasses_with_postponed_annotations(tm
         "from drakerock.exploration.problem import Objective\n"
         "from drakerock.study.objectives import register_objective\n\n\n"
         "@dataclass\nclass Scale:\n    factor: float = 2.0\n\n\n"
-        '@register_objective(Objective(name="twice the load", meaning="for a test"))\n'
+        '@register_objective(Objective(name="twice_the_load", meaning="for a test"))\n'
         "def calc(outcome):\n    return Scale().factor * outcome.bucket_mass_kg\n"
     )
     import_module(str(path))
-    assert get_objective("twice the load").objective.meaning == "for a test"
+    assert get_objective("twice_the_load").objective.meaning == "for a test"
