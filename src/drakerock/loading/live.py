@@ -16,7 +16,7 @@ FRAME_RATE = 10.0
 
 
 def make_live_station(scenario: Scenario, pile: PileState, meshcat: Meshcat) -> Station:
-    """Return a station that shows itself in `meshcat` as it is simulated, seen from behind the machine's side.
+    """Return a station that shows itself in `meshcat` as it is simulated, seen from the side.
 
     Raises:
         InputError: as `make_station`.
@@ -29,7 +29,7 @@ def make_live_station(scenario: Scenario, pile: PileState, meshcat: Meshcat) -> 
 
     toe = float(np.percentile(pile.p_WRs[:, 0], 2)) if len(pile) else 0.0
     height = scenario.site.drift_height
-    meshcat.SetCameraPose(
-        np.array([toe - 9.0, -0.45 * height, 0.8 * height]), np.array([toe, 0.0, 0.2 * height])
-    )
+    # Through the near wall, which is drawn all but transparent.
+    eye = np.array([toe - 5.0, -scenario.site.drift_width - 4.0, 0.8 * height])
+    meshcat.SetCameraPose(eye, np.array([toe - 1.0, 0.0, 0.2 * height]))
     return make_station(scenario, pile, visible=True, extend=show)
