@@ -78,7 +78,7 @@ def test_rocks_fall_with_the_moons_gravity_and_heap_up_as_on_earth(load):
     assert 10.0 < min(slopes) < max(slopes) < 40.0
 
 
-def test_admittance_eases_the_force_and_is_the_same_by_its_key(load):
+def test_admittance_slows_by_the_sensed_force_and_is_the_same_by_its_key(load):
     module = load("admittance")
     soft = module.main()
     assert soft.outcome.status == "done"
@@ -92,6 +92,13 @@ def test_admittance_eases_the_force_and_is_the_same_by_its_key(load):
     ours = make_station(soft.scenario, soft.pile_before, visible=False)
     assert isinstance(ours.controller, FeedforwardController)
     assert not isinstance(station.controller, FeedforwardController)
+    # On the way in, the plan's speed over 1 + F / 50 kN, F of the step before: a row has that of the step that begins.
+    seen = soft.signals
+    force = np.linalg.norm([seen[f"bucket_force_{axis}"] for axis in "xyz"], axis=0)
+    driving = np.flatnonzero(np.isin(seen["mode"], (0, 1)))[1:]
+    planned = soft.plan.drive_speed / ours.digger.kinematics.wheel_radius
+    assert seen["target_wheel_rate"][driving] == pytest.approx(planned / (1.0 + force[driving - 1] / 50e3))
+    assert seen["target_wheel_rate"][driving].min() < 0.5 * planned
     # The first seconds of the dig, bit for bit.
     simulator = Simulator(station.diagram)
     station.initialize(simulator.get_mutable_context())
