@@ -385,11 +385,13 @@ def study_confirm(
     scheduler: SchedulerOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Simulate chosen Pareto points again: predicted against simulated. Interrupted, it goes on when called again.
+    """Simulate chosen Pareto points again: predicted against simulated; the report then shows it.
+
+    Interrupted, it goes on when called again.
 
     Example: drakerock study confirm out/paper --points 5
     """
-    from drakerock.study.analysis import format_confirmation, run_confirm
+    from drakerock.study.analysis import format_confirmation, run_confirm, run_report
     from drakerock.study.resimulation import Resimulation
 
     def say(text: str) -> None:
@@ -398,11 +400,12 @@ def study_confirm(
     again = Resimulation(folder, workers=workers, scheduler=scheduler, say=say)
     with _show_progress("confirm") as advance:
         confirmation = run_confirm(folder, again.evaluate, points, again.run, advance)
+        report = run_report(folder, None, advance)[0]
     if json_:
         print(json.dumps(confirmation.to_rows(), indent=2))
     else:
         print(format_confirmation(confirmation))
-        _print_paths([folder / "confirmation.json"])
+        _print_paths([folder / "confirmation.json", report])
 
 
 @app.command()
@@ -415,20 +418,29 @@ def strategy(
         list[str] | None,
         typer.Option("--bound", "--bounds", help="Limit, such as 'debris<=500'; repeatable."),
     ] = None,
+    best: Annotated[
+        str | None,
+        typer.Option("--best", metavar="OBJECTIVE", help="The one objective that counts, within bounds."),
+    ] = None,
+    probability: Annotated[
+        float | None, typer.Option(help="With which each bound has to hold, 0.5 to 1 [default: 0.9].")
+    ] = None,
     knee: Annotated[bool, typer.Option("--knee", help="The knee point (what no weights mean).")] = False,
     json_: JsonOption = False,
 ) -> None:
-    """Print the Pareto-optimal strategy for a trade-off.
+    """Print the Pareto-optimal strategy for a trade-off, and how far the study can be relied on.
 
     Example: drakerock strategy out/paper --weights production=0.6,damage=0.2,debris=0.2
+
+    Example: drakerock strategy out/paper --best production --bound 'debris<=500'
     """
     from drakerock.study.analysis import run_strategy
 
-    if knee and weights is not None:
-        raise InputError("--knee and --weights exclude each other")
+    if knee + (weights is not None) + (best is not None) > 1:
+        raise InputError("--knee, --weights and --best exclude each other")
     limits = [part for text in bound or [] for part in text.split(",") if part.strip()]
     with _show_progress("strategy") as advance:
-        chosen = run_strategy(source, weights, limits, advance)
+        chosen = run_strategy(source, weights, limits, advance, best=best, probability=probability)
     print(json.dumps(chosen.to_dict(), indent=2) if json_ else chosen.to_text())
 
 
