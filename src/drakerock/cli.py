@@ -444,6 +444,51 @@ def strategy(
     print(json.dumps(chosen.to_dict(), indent=2) if json_ else chosen.to_text())
 
 
+@app.command()
+def plan(
+    scenario: ScenarioArgument = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for plan.json and plan.png.")] = None,
+    alpha: Annotated[float | None, typer.Option(help="Fill ratio aimed at, 0.2 to 2.")] = None,
+    beta: Annotated[float | None, typer.Option(help="Dig height, 0 deep to 1 shallow.")] = None,
+    gamma: Annotated[float | None, typer.Option(help="Entry point, 1 front-most, 0 rear-most.")] = None,
+    kappa: Annotated[float | None, typer.Option(help="Share of the curl done while lifting, 0 to 1.")] = None,
+    pile: Annotated[
+        Path | None, typer.Option(help="Another pile (.npz), or a plan.json whose height field is taken.")
+    ] = None,
+    study: Annotated[
+        Path | None, typer.Option(help="Study folder or response table that predicts the outcome.")
+    ] = None,
+    serve: Annotated[bool, typer.Option("--serve", help="A page with sliders, in the browser.")] = False,
+    set_: SetOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """Preview a strategy on a pile: the plan, and what a study predicts of it. Nothing is simulated.
+
+    Example: drakerock plan --alpha 1.3 --beta 0.85 --gamma 1 --kappa 0.6 --out out/plan
+
+    Example: drakerock plan studies/small.yaml --study out/small --serve
+    """
+    from drakerock.study.preview import Preview
+
+    strategy = {"alpha": alpha, "beta": beta, "gamma": gamma, "kappa": kappa}
+    overrides = [f"loading.strategy.{key}={value}" for key, value in strategy.items() if value is not None]
+    config = _load(scenario, None, [*(set_ or []), *overrides])
+    with _show_progress("plan"):
+        preview = Preview(config, pile, study)
+    if serve:
+        from drakerock.study.preview_server import serve_preview
+
+        serve_preview(preview, lambda address: output.print(f"plan page: {address} (Ctrl-C ends it)"))
+        return
+    shown = preview.describe(config.loading.strategy)
+    if json_:
+        print(json.dumps(shown.to_dict()))
+    else:
+        print(shown.to_text())
+    if out is not None:
+        _print_paths(shown.save(out))
+
+
 class FileKind(StrEnum):
     """Kinds of files that a schema describes."""
 

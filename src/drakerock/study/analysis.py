@@ -26,7 +26,7 @@ from drakerock.exploration.strategy import Strategy, choose_strategy, parse_weig
 from drakerock.exploration.surrogate import Surrogate, fit_surrogate
 from drakerock.exploration.table import ResponseTable
 from drakerock.exploration.validation import calc_learning_curve, validate
-from drakerock.exploration.verdict import judge
+from drakerock.exploration.verdict import Verdict, judge
 from drakerock.files import read_json, write_text
 from drakerock.study.db import DATABASE
 from drakerock.study.tables import export_tables
@@ -95,17 +95,50 @@ def run_strategy(
     limits = [parse_bound(text, table.problem, probability) for text in bounds]
     surrogate, front = _search_front(table, config, seed, limits, progress)
     chosen = choose_strategy(front, weights, limits)
-    verdict = judge(
-        validate(surrogate, table), table.role.count("sample"), *calc_learning_curve(surrogate, table)
-    )
-    return replace(
-        chosen, verdict=verdict, chosen_by=chosen.chosen_by if best is None else _name(best, limits)
-    )
+    name = chosen.chosen_by if best is None else _name(best, limits)
+    return replace(chosen, verdict=_judge(surrogate, table), chosen_by=name)
 
 
 def _name(best: str, limits: Sequence[Bound]) -> str:
     within = ", ".join(str(bound) for bound in limits)
     return f"best {best}{f', within {within}' if within else ''}"
+
+
+class Predictor:
+    """What the surrogate of a study or table says of any strategy, with a verdict on how far it can be relied on.
+
+    Args:
+        source: study folder or table file.
+
+    Attributes:
+        problem: its variables and objectives.
+        verdict: on its surrogate.
+
+    Raises:
+        InputError: see `ResponseTable.load` and `fit_surrogate`.
+    """
+
+    def __init__(self, source: str | Path) -> None:
+        table, config, seed = _load(Path(source))
+        self.problem = table.problem
+        self._surrogate = fit_surrogate(table, config.surrogate, seed)
+        self.verdict = _judge(self._surrogate, table)
+
+    def predict(self, values: Mapping[str, float]) -> Strategy:
+        """Return the prediction at a point, given by variable name; variables of others are left out.
+
+        Raises:
+            InputError: a variable is missing, or outside its range.
+        """
+        names = self.problem.variable_names
+        x = self.problem.make_point({name: values[name] for name in names if name in values})
+        y, std = self._surrogate.predict(x[None], return_std=True)
+        return Strategy(self.problem, x, y[0], std[0], -1, "hand", verdict=self.verdict)
+
+
+def _judge(surrogate: Surrogate, table: ResponseTable) -> Verdict:
+    curve = calc_learning_curve(surrogate, table)
+    return judge(validate(surrogate, table), table.role.count("sample"), *curve)
 
 
 def run_confirm(
