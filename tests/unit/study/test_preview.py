@@ -1,4 +1,4 @@
-"""The preview of a strategy: the plan of the station itself, a prediction with its verdict, and a page that shows both."""
+"""The preview of a strategy: its plan, a prediction with its verdict, and a page that shows both."""
 
 import json
 import shutil
