@@ -385,11 +385,13 @@ def study_confirm(
     scheduler: SchedulerOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Simulate chosen Pareto points again: predicted against simulated. Interrupted, it goes on when called again.
+    """Simulate chosen Pareto points again: predicted against simulated; the report then shows it.
+
+    Interrupted, it goes on when called again.
 
     Example: drakerock study confirm out/paper --points 5
     """
-    from drakerock.study.analysis import format_confirmation, run_confirm
+    from drakerock.study.analysis import format_confirmation, run_confirm, run_report
     from drakerock.study.resimulation import Resimulation
 
     def say(text: str) -> None:
@@ -398,11 +400,12 @@ def study_confirm(
     again = Resimulation(folder, workers=workers, scheduler=scheduler, say=say)
     with _show_progress("confirm") as advance:
         confirmation = run_confirm(folder, again.evaluate, points, again.run, advance)
+        report = run_report(folder, None, advance)[0]
     if json_:
         print(json.dumps(confirmation.to_rows(), indent=2))
     else:
         print(format_confirmation(confirmation))
-        _print_paths([folder / "confirmation.json"])
+        _print_paths([folder / "confirmation.json", report])
 
 
 @app.command()
@@ -415,21 +418,75 @@ def strategy(
         list[str] | None,
         typer.Option("--bound", "--bounds", help="Limit, such as 'debris<=500'; repeatable."),
     ] = None,
+    best: Annotated[
+        str | None,
+        typer.Option("--best", metavar="OBJECTIVE", help="The one objective that counts, within bounds."),
+    ] = None,
+    probability: Annotated[
+        float | None, typer.Option(help="With which each bound has to hold, 0.5 to 1 [default: 0.9].")
+    ] = None,
     knee: Annotated[bool, typer.Option("--knee", help="The knee point (what no weights mean).")] = False,
     json_: JsonOption = False,
 ) -> None:
-    """Print the Pareto-optimal strategy for a trade-off.
+    """Print the Pareto-optimal strategy for a trade-off, and how far the study can be relied on.
 
     Example: drakerock strategy out/paper --weights production=0.6,damage=0.2,debris=0.2
+
+    Example: drakerock strategy out/paper --best production --bound 'debris<=500'
     """
     from drakerock.study.analysis import run_strategy
 
-    if knee and weights is not None:
-        raise InputError("--knee and --weights exclude each other")
+    if knee + (weights is not None) + (best is not None) > 1:
+        raise InputError("--knee, --weights and --best exclude each other")
     limits = [part for text in bound or [] for part in text.split(",") if part.strip()]
     with _show_progress("strategy") as advance:
-        chosen = run_strategy(source, weights, limits, advance)
+        chosen = run_strategy(source, weights, limits, advance, best=best, probability=probability)
     print(json.dumps(chosen.to_dict(), indent=2) if json_ else chosen.to_text())
+
+
+@app.command()
+def plan(
+    scenario: ScenarioArgument = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for plan.json and plan.png.")] = None,
+    alpha: Annotated[float | None, typer.Option(help="Fill ratio aimed at, 0.2 to 2.")] = None,
+    beta: Annotated[float | None, typer.Option(help="Dig height, 0 deep to 1 shallow.")] = None,
+    gamma: Annotated[float | None, typer.Option(help="Entry point, 1 front-most, 0 rear-most.")] = None,
+    kappa: Annotated[float | None, typer.Option(help="Share of the curl done while lifting, 0 to 1.")] = None,
+    pile: Annotated[
+        Path | None, typer.Option(help="Another pile (.npz), or a plan.json whose height field is taken.")
+    ] = None,
+    study: Annotated[
+        Path | None, typer.Option(help="Study folder or response table that predicts the outcome.")
+    ] = None,
+    serve: Annotated[bool, typer.Option("--serve", help="A page with sliders, in the browser.")] = False,
+    set_: SetOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """Preview a strategy on a pile: the plan, and what a study predicts of it. Nothing is simulated.
+
+    Example: drakerock plan --alpha 1.3 --beta 0.85 --gamma 1 --kappa 0.6 --out out/plan
+
+    Example: drakerock plan studies/small.yaml --study out/small --serve
+    """
+    from drakerock.study.preview import Preview
+
+    strategy = {"alpha": alpha, "beta": beta, "gamma": gamma, "kappa": kappa}
+    overrides = [f"loading.strategy.{key}={value}" for key, value in strategy.items() if value is not None]
+    config = _load(scenario, None, [*(set_ or []), *overrides])
+    with _show_progress("plan"):
+        preview = Preview(config, pile, study)
+    if serve:
+        from drakerock.study.preview_server import serve_preview
+
+        serve_preview(preview, lambda address: output.print(f"plan page: {address} (Ctrl-C ends it)"))
+        return
+    shown = preview.describe(config.loading.strategy)
+    if json_:
+        print(json.dumps(shown.to_dict()))
+    else:
+        print(shown.to_text())
+    if out is not None:
+        _print_paths(shown.save(out))
 
 
 class FileKind(StrEnum):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from drakerock.exploration.strategy import Strategy, choose_strategy
 from drakerock.exploration.surrogate import Surrogate, fit_surrogate
 from drakerock.exploration.table import ResponseTable
 from drakerock.exploration.validation import Accuracy, calc_learning_curve, validate
+from drakerock.exploration.verdict import Verdict, judge
 
 Progress = Callable[[str, float | None], None]
 """Called with what is being done and the share of it that is done, None where that is not known."""
@@ -53,6 +55,11 @@ class Exploration:
     references: dict[str, tuple[Array, Array, Array]]
     to_confirm: Indices
     confirmation: Confirmation | None = None
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """How far all this can be relied on."""
+        return judge(self.accuracy, self.table.role.count("sample"), self.learning_sizes, self.learning_nrmse)
 
 
 def explore(
@@ -145,6 +152,7 @@ def summarize(exploration: Exploration) -> dict[str, Any]:
     return {
         "points": {role: roles.count(role) for role in ("sample", "validation")},
         "loadings": {"run": sum(exploration.table.n_loadings), "failed": sum(exploration.table.n_failed)},
+        "verdict": exploration.verdict.to_dict(),
         "objectives": objectives,
         "front_points": len(exploration.front),
         "strategies": {name: strategy.to_dict() for name, strategy in exploration.strategies.items()},

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from statistics import NormalDist
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -60,14 +61,40 @@ class Bound(Config):
     objective: str
     relation: Literal["<=", ">="]
     value: float
+    probability: Annotated[
+        float,
+        Field(
+            ge=0.5,
+            lt=1.0,
+            description="with which it has to hold, by the surrogate's own uncertainty; 0.5: none",
+        ),
+    ] = 0.9
 
     def __str__(self) -> str:
         return f"{self.objective}{self.relation}{self.value:g}"
 
-    def calc_violation(self, problem: Problem, Y: Array) -> Array:
-        """Return by how much each row of Y (n, k) breaks the bound, (n,); negative where it holds."""
-        excess = Y[:, problem.get_objective(self.objective)[0]] - self.value
-        return excess if self.relation == "<=" else -excess
+    def calc_violation(self, problem: Problem, Y: Array, std: Array) -> Array:
+        """Return by how much the bound is broken (n,); negative where it holds with its probability.
+
+        Args:
+            problem: variables and objectives.
+            Y, std: (n, k) predicted objectives and their standard deviations.
+        """
+        excess, spread = self._calc_excess(problem, Y, std)
+        return excess + NormalDist().inv_cdf(self.probability) * spread
+
+    def calc_probability(self, problem: Problem, Y: Array, std: Array) -> Array:
+        """Return the probability (n,) with which it holds; arguments as of `calc_violation`."""
+        excess, spread = self._calc_excess(problem, Y, std)
+        sure = (excess <= 0.0).astype(float)
+        known = spread > 0.0
+        sure[known] = [NormalDist().cdf(z) for z in -excess[known] / spread[known]]
+        return sure
+
+    def _calc_excess(self, problem: Problem, Y: Array, std: Array) -> tuple[Array, Array]:
+        j = problem.get_objective(self.objective)[0]
+        excess = Y[:, j] - self.value
+        return (excess if self.relation == "<=" else -excess), std[:, j]
 
 
 class ParetoConfig(Config):

@@ -39,8 +39,8 @@ Indices = NDArray[np.int_]
 MANY_OBJECTIVES = 5
 
 
-def parse_bound(text: str, problem: Problem) -> Bound:
-    """Read a bound such as ``debris<=500``.
+def parse_bound(text: str, problem: Problem, probability: float | None = None) -> Bound:
+    """Read a bound such as ``debris<=500``, which is to hold with a probability (None: the default of `Bound`).
 
     Raises:
         InputError: not of that form, unknown objective.
@@ -55,7 +55,10 @@ def parse_bound(text: str, problem: Problem) -> Bound:
             f"bound '{text}': expected objective<=number or objective>=number, such as debris<=500"
         )
     problem.get_objective(match[1])
-    return Bound(objective=match[1], relation="<=" if match[2] == "<=" else ">=", value=value)
+    if probability is not None and not 0.5 <= probability < 1.0:
+        raise InputError(f"probability of the bounds is {probability:g}; at least 0.5, below 1")
+    given = {} if probability is None else {"probability": probability}
+    return Bound(objective=match[1], relation="<=" if match[2] == "<=" else ">=", value=value, **given)
 
 
 class Model(Protocol):
@@ -220,10 +223,13 @@ class _Search(PymooProblem):  # type: ignore[misc]
         self._surrogate, self._problem, self._bounds, self._cone = surrogate, problem, bounds, cone
 
     def _evaluate(self, x: Array, out: dict[str, Array], *args: Any, **kwargs: Any) -> None:
-        Y = self._surrogate.predict(self._problem.unscale(x))
+        X = self._problem.unscale(x)
+        if not self._bounds:
+            out["F"] = self._surrogate.predict(X) @ self._cone.T
+            return
+        Y, std = self._surrogate.predict(X, return_std=True)
         out["F"] = Y @ self._cone.T
-        if self._bounds:
-            out["G"] = np.column_stack([bound.calc_violation(self._problem, Y) for bound in self._bounds])
+        out["G"] = np.column_stack([bound.calc_violation(self._problem, Y, std) for bound in self._bounds])
 
 
 def _run_search(search: _Search, config: ParetoConfig, seed: int, history: _History) -> list[Any]:
@@ -321,5 +327,5 @@ def _describe_infeasible(surrogate: Model, problem: Problem, bounds: Sequence[Bo
         value = Y[:, i].min() if bound.relation == "<=" else Y[:, i].max()
         unit = "" if objective.unit == "-" else f" {objective.unit}"
         reached.append(f"{bound.objective} {value:.4g}{unit}")
-    wanted = ", ".join(str(bound) for bound in bounds)
+    wanted = ", ".join(f"{bound} ({100 * bound.probability:g} % sure)" for bound in bounds)
     return f"no strategy satisfies {wanted} on the surrogate; the nearest tried reach {', '.join(reached)}"

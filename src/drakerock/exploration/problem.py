@@ -71,6 +71,10 @@ class Objective(Config):
             description="value of a loading that has no finite one, such as energy per mass of nothing; a bound"
         ),
     ] = None
+    lowest: Annotated[
+        Magnitude | None,
+        Field(description="values below do not exist, such as negative masses; predictions are cut there"),
+    ] = None
 
     @property
     def sign(self) -> float:
@@ -101,9 +105,15 @@ class Problem(Config):
     )
     objectives: tuple[Objective, ...] = Field(
         default=(
-            Objective(name="production", sense="max", unit="kg/s", meaning="loaded mass over loading time"),
-            Objective(name="damage", meaning="overload of the bucket hinge over time"),
-            Objective(name="debris", unit="kg", meaning="rock left on the floor after loading"),
+            Objective(
+                name="production",
+                sense="max",
+                unit="kg/s",
+                meaning="loaded mass over loading time",
+                lowest=0.0,
+            ),
+            Objective(name="damage", meaning="overload of the bucket hinge over time", lowest=0.0),
+            Objective(name="debris", unit="kg", meaning="rock left on the floor after loading", lowest=0.0),
         ),
         min_length=1,
     )

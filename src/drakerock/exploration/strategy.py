@@ -12,6 +12,7 @@ from drakerock.errors import InputError
 from drakerock.exploration.config import Bound
 from drakerock.exploration.pareto import ParetoFront
 from drakerock.exploration.problem import Array, Problem, format_number
+from drakerock.exploration.verdict import Grade, Verdict
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class Strategy:
         index: its place on the front.
         chosen_by: what was asked for, in words.
         p_optimal: share of the surrogate's draws in which it stays Pareto-optimal; NaN if not calculated.
+        bounds: the limits it keeps, each with the probability that it does.
+        verdict: how far the surrogate can be relied on; None if it was not judged. What it is unfit for is not told.
     """
 
     problem: Problem
@@ -35,16 +38,31 @@ class Strategy:
     index: int
     chosen_by: str
     p_optimal: float = float("nan")
+    bounds: tuple[tuple[Bound, float], ...] = ()
+    verdict: Verdict | None = None
+
+    def is_known(self, objective: str) -> bool:
+        """Return whether an objective's prediction means anything."""
+        return self.verdict is None or self.verdict.get(objective).grade > Grade.UNFIT
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON: strategy, objectives and their standard deviations by name."""
+        """Return plain data for JSON: strategy, objectives and their standard deviations by name.
+
+        An objective that the surrogate is unfit for is null.
+        """
         variables, objectives = self.problem.variable_names, self.problem.objective_names
+        known = [self.is_known(name) for name in objectives]
+        y, std = (
+            [float(v) if k else None for v, k in zip(row, known, strict=True)] for row in (self.y, self.std)
+        )
         return {
             "chosen_by": self.chosen_by,
             "strategy": dict(zip(variables, map(float, self.x), strict=True)),
-            "objectives": dict(zip(objectives, map(float, self.y), strict=True)),
-            "standard_deviations": dict(zip(objectives, map(float, self.std), strict=True)),
+            "objectives": dict(zip(objectives, y, strict=True)),
+            "standard_deviations": dict(zip(objectives, std, strict=True)),
             "p_optimal": None if np.isnan(self.p_optimal) else float(self.p_optimal),
+            "bounds": {str(bound): p if self.is_known(bound.objective) else None for bound, p in self.bounds},
+            "verdict": None if self.verdict is None else self.verdict.to_dict(),
         }
 
     def to_text(self) -> str:
@@ -57,7 +75,19 @@ class Strategy:
         lines.append("Predicted")
         for o, value, std in zip(self.problem.objectives, self.y, self.std, strict=True):
             unit = "" if o.unit == "-" else f" {o.unit}"
-            lines.append(f"  {o.name:<{width}}  {format_number(value, 4)} +- {format_number(std, 2)}{unit}")
+            text = f"{format_number(value, 4)} +- {format_number(std, 2)}{unit}"
+            lines.append(
+                f"  {o.name:<{width}}  {text if self.is_known(o.name) else 'not known (see the verdict)'}"
+            )
+        for bound, p in self.bounds:
+            sure = (
+                f"holds with a probability of {100 * p:.0f} %"
+                if self.is_known(bound.objective)
+                else "not known"
+            )
+            lines.append(f"  {bound}: {sure}")
+        if self.verdict is not None:
+            lines.append(f"Verdict on the study: {self.verdict.to_text()}")
         return "\n".join(lines)
 
 
@@ -105,7 +135,7 @@ def choose_strategy(
     problem = front.problem
     inside = np.ones(len(front), dtype=bool)
     for bound in bounds:
-        inside &= bound.calc_violation(problem, front.Y) <= 0.0
+        inside &= bound.calc_violation(problem, front.Y, front.std) <= 1e-9 * abs(bound.value)
     wanted = ", ".join(str(bound) for bound in bounds)
     if not inside.any():
         best = ", ".join(
@@ -133,6 +163,10 @@ def choose_strategy(
         i,
         f"{name}{f', within {wanted}' if wanted else ''}",
         p_optimal,
+        tuple(
+            (bound, float(bound.calc_probability(problem, front.Y[[i]], front.std[[i]])[0]))
+            for bound in bounds
+        ),
     )
 
 

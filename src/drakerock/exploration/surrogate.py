@@ -362,14 +362,19 @@ class Surrogate(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return predicted objectives (n, k) and, with `return_std`, their standard deviations (n, k)."""
         check_is_fitted(self)
         if not return_std:
-            return np.column_stack([model.predict(X) for model in self.models_])
+            return self._cut(np.column_stack([model.predict(X) for model in self.models_]))
         pairs = [model.predict(X, return_std=True) for model in self.models_]
-        return np.column_stack([m for m, _ in pairs]), np.column_stack([s for _, s in pairs])
+        return self._cut(np.column_stack([m for m, _ in pairs])), np.column_stack([s for _, s in pairs])
 
     def draw(self, X: ArrayLike, n_draws: int, rng: np.random.Generator) -> Array:
         """Return joint posterior draws (n_draws, n, k) at X (n, d); objectives are independent."""
         check_is_fitted(self)
-        return np.stack([model.draw(X, n_draws, rng) for model in self.models_], axis=2)
+        return self._cut(np.stack([model.draw(X, n_draws, rng) for model in self.models_], axis=2))
+
+    def _cut(self, Y: Array) -> Array:
+        """Return objectives (..., k) without values that do not exist."""
+        lowest = [objective.lowest for objective in self.problem_.objectives]
+        return np.maximum(Y, [-np.inf if value is None else value for value in lowest])
 
 
 def fit_surrogate(table: ResponseTable, config: SurrogateConfig | None = None, seed: int = 0) -> Surrogate:

@@ -123,7 +123,7 @@ def validate(surrogate: Surrogate, table: ResponseTable) -> tuple[Accuracy, ...]
         there = np.isfinite(others.Y[:, j])
         simulated, se = others.Y[there, j], others.noise[there, j]
         if there.any():
-            mean, std = model.predict(others.X[there], return_std=True)
+            mean, std = (values[:, j] for values in surrogate.predict(others.X[there], return_std=True))
         else:
             mean = std = np.empty(0)
         own = np.where(np.isfinite(se), se, np.sqrt(model.lam_ * model.sigma2_))

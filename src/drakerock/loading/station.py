@@ -179,11 +179,7 @@ def make_station(
             plant, pile, scenario.rocks, dynamics.plant, dynamics.reference_overlap, shapes
         )
     plant.Finalize()
-    digger = DiggingMachine(
-        make_kinematics(plant, machine),
-        make_bucket_geometry(plant, scene_graph, machine),
-        _calc_machine_width(plant, scene_graph, machine),
-    )
+    digger = make_digging_machine(plant, scene_graph, machine)
     bucket = plant.GetBodyByName("bucket", machine.instance).index()
 
     motors = builder.AddSystem(MotorTargets(plant, machine))
@@ -299,6 +295,19 @@ def _make_planner(view: StationView) -> DigPlanner:
         view.scenario.site.drift_width,
         loading.control.speed_floor,
         stored=None if source is None else load_plan(source)[0],
+    )
+
+
+def make_digging_machine(plant: MultibodyPlant, scene_graph: SceneGraph, machine: Machine) -> DiggingMachine:
+    """Return what a plan needs to know of the machine in a finalized plant.
+
+    Raises:
+        InputError: see `make_kinematics` and `make_bucket_geometry`.
+    """
+    return DiggingMachine(
+        make_kinematics(plant, machine),
+        make_bucket_geometry(plant, scene_graph, machine),
+        _calc_machine_width(plant, scene_graph, machine),
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from drakerock.exploration.problem import Array, Problem, format_number
 from drakerock.exploration.strategy import Strategy, choose_strategy, parse_weights
 from drakerock.exploration.surrogate import Surrogate, fit_surrogate
 from drakerock.exploration.table import ResponseTable
+from drakerock.exploration.validation import calc_learning_curve, validate
+from drakerock.exploration.verdict import Verdict, judge
 from drakerock.files import read_json, write_text
 from drakerock.study.db import DATABASE
 from drakerock.study.tables import export_tables
@@ -64,24 +67,78 @@ def run_strategy(
     weights: Mapping[str, float] | str | None = None,
     bounds: Sequence[str] = (),
     progress: Progress | None = None,
+    *,
+    best: str | None = None,
+    probability: float | None = None,
 ) -> Strategy:
-    """Return the Pareto-optimal strategy of a study or table for a trade-off.
+    """Return the Pareto-optimal strategy of a study or table for a trade-off, with a verdict on the study.
 
     Args:
         source: study folder or table file.
         weights: by objective, as a mapping or as text (``production=0.6,damage=0.4``); None: the knee point.
         bounds: limits such as ``debris<=500``. The front is searched within them.
         progress: told what is being done.
+        best: instead of weights: the objective that counts alone, within the bounds.
+        probability: with which each bound has to hold; None: 0.9.
 
     Raises:
-        InputError: see `parse_weights`, `parse_bound`, `pareto_front` and `choose_strategy`.
+        InputError: weights and `best` both; see `parse_weights`, `parse_bound`, `pareto_front` and `choose_strategy`.
     """
     table, config, seed = _load(Path(source))
     if isinstance(weights, str):
         weights = parse_weights(weights, table.problem)
-    limits = [parse_bound(text, table.problem) for text in bounds]
-    front = _search_front(table, config, seed, limits, progress)[1]
-    return choose_strategy(front, weights, limits)
+    if best is not None:
+        if weights is not None:
+            raise InputError("weights and a best objective exclude each other")
+        table.problem.get_objective(best)
+        weights = {best: 1.0}
+    limits = [parse_bound(text, table.problem, probability) for text in bounds]
+    surrogate, front = _search_front(table, config, seed, limits, progress)
+    chosen = choose_strategy(front, weights, limits)
+    name = chosen.chosen_by if best is None else _name(best, limits)
+    return replace(chosen, verdict=_judge(surrogate, table), chosen_by=name)
+
+
+def _name(best: str, limits: Sequence[Bound]) -> str:
+    within = ", ".join(str(bound) for bound in limits)
+    return f"best {best}{f', within {within}' if within else ''}"
+
+
+class Predictor:
+    """What the surrogate of a study or table says of any strategy, with a verdict on how far it can be relied on.
+
+    Args:
+        source: study folder or table file.
+
+    Attributes:
+        problem: its variables and objectives.
+        verdict: on its surrogate.
+
+    Raises:
+        InputError: see `ResponseTable.load` and `fit_surrogate`.
+    """
+
+    def __init__(self, source: str | Path) -> None:
+        table, config, seed = _load(Path(source))
+        self.problem = table.problem
+        self._surrogate = fit_surrogate(table, config.surrogate, seed)
+        self.verdict = _judge(self._surrogate, table)
+
+    def predict(self, values: Mapping[str, float]) -> Strategy:
+        """Return the prediction at a point, given by variable name; variables of others are left out.
+
+        Raises:
+            InputError: a variable is missing, or outside its range.
+        """
+        names = self.problem.variable_names
+        x = self.problem.make_point({name: values[name] for name in names if name in values})
+        y, std = self._surrogate.predict(x[None], return_std=True)
+        return Strategy(self.problem, x, y[0], std[0], -1, "hand", verdict=self.verdict)
+
+
+def _judge(surrogate: Surrogate, table: ResponseTable) -> Verdict:
+    curve = calc_learning_curve(surrogate, table)
+    return judge(validate(surrogate, table), table.role.count("sample"), *curve)
 
 
 def run_confirm(

@@ -105,25 +105,35 @@ def import_module(name: str) -> None:
 
 
 @register_objective(
-    Objective(name="production", sense="max", unit="kg/s", meaning="loaded mass over loading time")
+    Objective(
+        name="production", sense="max", unit="kg/s", meaning="loaded mass over loading time", lowest=0.0
+    )
 )
 def _get_production(outcome: CycleOutcome) -> float | None:
     return outcome.objectives["production"]
 
 
-@register_objective(Objective(name="damage", meaning="overload of the bucket hinge over time"))
+@register_objective(Objective(name="damage", meaning="overload of the bucket hinge over time", lowest=0.0))
 def _get_damage(outcome: CycleOutcome) -> float | None:
     return outcome.objectives["damage"]
 
 
-@register_objective(Objective(name="debris", unit="kg", meaning="rock left on the floor after loading"))
+@register_objective(
+    Objective(name="debris", unit="kg", meaning="rock left on the floor after loading", lowest=0.0)
+)
 def _get_debris(outcome: CycleOutcome) -> float | None:
     return outcome.objectives["debris"]
 
 
 @register_objective(
     # A full bucket takes some 300 J/kg; a megajoule for a rock of 100 kg is as bad as nothing.
-    Objective(name="specific_energy", unit="J/kg", meaning="the motors' work over the loaded mass", worst=1e4)
+    Objective(
+        name="specific_energy",
+        unit="J/kg",
+        meaning="the motors' work over the loaded mass",
+        worst=1e4,
+        lowest=0.0,
+    )
 )
 def _calc_specific_energy(outcome: CycleOutcome) -> float | None:
     if outcome.energy_J is None or outcome.bucket_mass_kg is None:
@@ -132,7 +142,9 @@ def _calc_specific_energy(outcome: CycleOutcome) -> float | None:
 
 
 @register_objective(
-    Objective(name="peak_force", unit="N", meaning="largest force of the rocks against the bucket")
+    Objective(
+        name="peak_force", unit="N", meaning="largest force of the rocks against the bucket", lowest=0.0
+    )
 )
 def _get_peak_force(outcome: CycleOutcome) -> float | None:
     return outcome.peak_push_force_N

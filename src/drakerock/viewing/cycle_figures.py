@@ -412,6 +412,32 @@ def _make_plan_figure(cycle: StoredCycle, plan: DigPlan) -> Figure:
     return figure
 
 
+def make_preview_figure(field: HeightField, profile: PileProfile, plan: DigPlan | None) -> Figure:
+    """Return a plan on a pile that is known by its height field only: from the side, and from above.
+
+    Args:
+        field: the pile as it is seen.
+        profile: its curves.
+        plan: what would be tried; None: there is none.
+    """
+    figure = Figure(figsize=(9, 9), layout="constrained")
+    side, top = figure.subplots(2, 1)
+    draw_height_field(top, field, profile, plan)
+    side.set(xlabel="x [m]", ylabel="z [m]", aspect="equal")
+    if plan is None:
+        side.set_title("No plan", loc="left", fontsize=11)
+        return figure
+    draw_surface(side, field, plan.y)
+    draw_plan(side, plan)
+    side.axhline(0.0, color="k", lw=0.8)
+    side.set_xlim(float(plan.x.min()) - 0.5, field.x_end + 0.2)
+    note = "" if plan.reached else ", the nearest that can be reached"
+    title = f"Plan at y = {plan.y:.2f} m: {plan.volume:.2f} of {plan.volume_wanted:.2f} m³{note}"
+    side.set_title(title, loc="left", fontsize=11)
+    side.legend(loc="upper left", fontsize=8)
+    return figure
+
+
 def _make_tip_path_figure(cycle: StoredCycle, plan: DigPlan) -> Figure:
     figure = Figure(figsize=(9, 4.5), layout="constrained")
     ax = draw_tip_paths(figure.subplots(), plan, cycle.signals)

@@ -8,6 +8,7 @@ import json
 from importlib.metadata import version
 from itertools import combinations
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -240,7 +241,25 @@ def _list_front(exploration: Exploration) -> dict[str, Any]:
             {"name": v.name, "label": v.label, "unit": "" if v.unit == "-" else v.unit}
             for v in problem.variables
         ],
-        "objectives": [{"name": o.name, "unit": "" if o.unit == "-" else o.unit} for o in problem.objectives],
+        "objectives": [
+            {
+                "name": o.name,
+                "unit": "" if o.unit == "-" else o.unit,
+                "sign": o.sign,
+                "best": _significant(best),
+                "worst": _significant(worst),
+                "fit": judgement.grade.name.lower(),
+            }
+            for o, best, worst, judgement in zip(
+                problem.objectives,
+                exploration.front.ideal,
+                exploration.front.nadir,
+                exploration.verdict.judgements,
+                strict=True,
+            )
+        ],
+        # Of a bound that is to hold with 90 %, in standard deviations.
+        "margin": round(NormalDist().inv_cdf(0.9), 6),
     }
 
 

@@ -1,9 +1,11 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import norm
 
 from drakerock.errors import InputError
 from drakerock.exploration.config import Bound, ParetoConfig
@@ -12,6 +14,8 @@ from drakerock.exploration.problem import Objective, Problem, Variable
 from drakerock.exploration.problems import make_noisy_loading
 from drakerock.exploration.strategy import choose_strategy, parse_weights
 from drakerock.exploration.surrogate import Surrogate
+from drakerock.exploration.validation import Accuracy, Comparison
+from drakerock.exploration.verdict import judge
 
 KNOWN = make_noisy_loading()
 NAMES = KNOWN.problem.objective_names
@@ -77,12 +81,52 @@ def test_only_the_ratio_of_weights_counts(front, factor):
 def test_bounds_are_kept(front):
     bounds = [Bound(objective="debris", relation="<=", value=500.0)]
     chosen = choose_strategy(front, {"production": 1.0}, bounds)
-    inside = front.Y[front.Y[:, 2] <= 500.0]
+    # So far below that it holds with 90 %: 1.2816 standard deviations.
+    inside = front.Y[front.Y[:, 2] + 1.2816 * front.std[:, 2] <= 500.0]
     assert chosen.y[2] <= 500.0
+    ((bound, probability),) = chosen.bounds
+    assert bound == bounds[0]
+    assert probability >= 0.9
+    assert probability == pytest.approx(norm.cdf((500.0 - chosen.y[2]) / chosen.std[2]))
+    assert f"debris<=500: holds with a probability of {100 * probability:.0f} %" in chosen.to_text()
     assert chosen.y[0] == inside[:, 0].max()
     assert "debris<=500" in chosen.chosen_by
     with pytest.raises(InputError, match=r"satisfies production>=999; the front has production"):
         choose_strategy(front, bounds=[Bound(objective="production", relation=">=", value=999.0)])
+
+
+def test_a_bound_that_has_to_be_surer_leaves_fewer_points(front):
+    counts = []
+    front = replace(front, std=np.full_like(front.std, 60.0))
+    for probability in (0.5, 0.9, 0.999):
+        bound = Bound(objective="debris", relation="<=", value=700.0, probability=probability)
+        inside = bound.calc_violation(KNOWN.problem, front.Y, front.std) <= 0.0
+        assert np.array_equal(
+            inside, bound.calc_probability(KNOWN.problem, front.Y, front.std) >= probability
+        )
+        counts.append(inside.sum())
+    assert counts[0] == (front.Y[:, 2] <= 700.0).sum() > counts[1] > counts[2] > 0
+
+
+def test_what_the_surrogate_is_unfit_for_is_not_told(front):
+    compared = Comparison(np.arange(20.0), np.arange(20.0)[::-1], np.ones(20))
+    bad = Accuracy("damage", 19.0, compared, compared, 0.6, 0.6, 0.01, (0.1, 0.1, 0.1))
+    good = Comparison(np.arange(20.0), np.arange(20.0), np.ones(20))
+    fine = [
+        Accuracy(name, 19.0, good, good, 0.0, 0.0, 0.01, (1.0, 1.0, 1.0)) for name in ("production", "debris")
+    ]
+    verdict = judge([fine[0], bad, fine[1]], 100)
+    bounds = [Bound(objective="damage", relation="<=", value=1e6)]
+    chosen = replace(choose_strategy(front, {"production": 1.0}, bounds), verdict=verdict)
+    text, data = chosen.to_text(), chosen.to_dict()
+    assert f"damage      {chosen.y[1]:.4g}"[:14] not in text
+    assert "not known (see the verdict)" in text
+    assert "damage<=1e+06: not known" in text
+    assert "Not fit for decisions" in text
+    assert data["objectives"]["damage"] is data["standard_deviations"]["damage"] is None
+    assert data["objectives"]["production"] == chosen.y[0]
+    assert data["bounds"] == {"damage<=1e+06": None}
+    assert data["verdict"]["objectives"]["damage"]["fit"] == "unfit"
 
 
 def test_knee_gives_up_little_of_everything(front):

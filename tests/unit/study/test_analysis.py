@@ -66,6 +66,27 @@ def test_bounds_and_knee(folder, run):
     free = json.loads(run("strategy", folder, "--weights", "production=1", "--json").stdout)
     assert bounded["objectives"]["debris"] <= 500.0 < free["objectives"]["debris"]
     assert bounded["objectives"]["production"] < free["objectives"]["production"]
+    assert bounded["bounds"]["debris<=500"] >= 0.9
+    assert bounded["verdict"]["fit"] in ("good", "rough")
+    best = json.loads(
+        run("strategy", folder, "--best", "production", "--bound", "debris<=500", "--json").stdout
+    )
+    assert best["strategy"] == bounded["strategy"]
+    assert best["chosen_by"] == "best production, within debris<=500"
+    surer = json.loads(
+        run(
+            "strategy",
+            folder,
+            "--best",
+            "production",
+            "--bound",
+            "debris<=500",
+            "--probability",
+            "0.99",
+            "--json",
+        ).stdout
+    )
+    assert surer["bounds"]["debris<=500"] >= 0.99
     both = json.loads(run("strategy", folder, "--bounds", "debris<=600,damage<=1.2", "--json").stdout)
     assert both["objectives"]["debris"] <= 600.0
     assert both["objectives"]["damage"] <= 1.2
@@ -88,9 +109,7 @@ def test_confirm_then_report(folder, run):
     rows = json.loads((folder / "confirmation.json").read_text())
     truth = KNOWN.evaluate(np.array([[rows[0][name] for name in KNOWN.problem.variable_names]]))[0]
     assert rows[0]["production_simulated"] == pytest.approx(truth[0])
-    result = run("study", "report", folder)
-    assert result.exit_code == 0, result.output
-    assert "report.html" in result.stdout
+    assert "report.html" in result.stdout, "the report shows the confirmation at once"
     page = (folder / "report" / "report.html").read_text(encoding="utf-8")
     assert "<title>Exploration of trial</title>" in page
     assert "Front points simulated again" in page
@@ -119,8 +138,14 @@ def test_errors_name_file_and_key(tmp_path, folder):
         run_strategy(tmp_path, "damage=1,damage=2")
     with pytest.raises(InputError, match="cannot be read: File name too long"):
         run_strategy("x" * 5000)
-    with pytest.raises(InputError, match="no strategy satisfies production>=900"):
+    with pytest.raises(InputError, match=r"no strategy satisfies production>=900 \(90 % sure\)"):
         run_strategy(folder, bounds=["production>=900"])
+    with pytest.raises(InputError, match=r"probability of the bounds is 1\.5; at least 0\.5, below 1"):
+        run_strategy(folder, bounds=["production>=900"], probability=1.5)
+    with pytest.raises(InputError, match="unknown objective 'speed'"):
+        run_strategy(folder, best="speed")
+    with pytest.raises(InputError, match="exclude each other"):
+        run_strategy(folder, "damage=1", best="damage")
     (tmp_path / "study.json").write_text(json.dumps({"exploration": {"pareto": {"population": 1}}}))
     with pytest.raises(InputError, match=r"study\.json: exploration\.pareto\.population"):
         run_strategy(tmp_path)

@@ -13,7 +13,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from drakerock.exploration.analysis import explore
-from drakerock.exploration.config import ExplorationConfig, ParetoConfig, SensitivityConfig, SurrogateConfig
+from drakerock.exploration.config import (
+    Bound,
+    ExplorationConfig,
+    ParetoConfig,
+    SensitivityConfig,
+    SurrogateConfig,
+)
 from drakerock.exploration.confirmation import confirm_points
 from drakerock.exploration.problem import Objective, Problem, Variable
 from drakerock.exploration.problems import make_noisy_loading, make_noisy_table
@@ -103,6 +109,8 @@ def test_report_tells_the_numbers(written, exploration):
     text = " ".join(" ".join(Links(written[0].read_text(encoding="utf-8")).text).split())
     knee = exploration.strategies["knee"]
     assert "Trial <1>" in text
+    assert exploration.verdict.title in text
+    assert exploration.verdict.judgements[1].to_text() in text
     assert f"{knee.x[0]:.3f}" in text
     assert f"{knee.y[0]:.4g}" in text
     assert "stuck </script><b>at 3 s" in text, "reasons of failures are shown as they are, and are no HTML"
@@ -149,19 +157,34 @@ def find_browser():
     )
 
 
+MOVE_A_BOUND = """<script>
+const slider = document.querySelectorAll("#bounds input")[2];
+slider.value = 0.3;
+slider.dispatchEvent(new Event("input"));
+</script></body>"""
+
+
 @pytest.mark.skipif(find_browser() is None, reason="no browser on this machine")
-def test_page_runs_in_a_browser_without_errors(written, exploration, tmp_path):
-    """The console stays free, and the page's own choice by weights is that of choose_strategy."""
+@pytest.mark.parametrize("bounded", [False, True])
+def test_page_runs_in_a_browser_without_errors(written, exploration, tmp_path, bounded):
+    """The console stays free, and the page's own choice by weights and bounds is that of choose_strategy."""
+    front, page, bounds = exploration.front, tmp_path / "page.html", []
+    text = written[0].read_text(encoding="utf-8")
+    if bounded:
+        text = text.replace("</body>", MOVE_A_BOUND)
+        value = float(f"{front.ideal[2] + 0.3 * (front.nadir[2] - front.ideal[2]):.3g}")
+        bounds = [Bound(objective="debris", relation="<=", value=value)]
+    page.write_text(text, encoding="utf-8")
     command = [
         find_browser(), "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
-        "--disable-component-update", "--disable-sync", f"--user-data-dir={tmp_path}",
+        "--disable-component-update", "--disable-sync", f"--user-data-dir={tmp_path / 'browser'}",
         "--enable-logging=stderr",
-        "--virtual-time-budget=5000", "--dump-dom", written[0].as_uri(),
+        "--virtual-time-budget=5000", "--dump-dom", page.as_uri(),
     ]  # fmt: skip
     result = subprocess.run(command, capture_output=True, text=True, timeout=90)
     console = [line for line in result.stderr.splitlines() if "CONSOLE" in line]
     assert console == []
-    expected = choose_strategy(exploration.front, dict.fromkeys(KNOWN.problem.objective_names, 1.0))
+    expected = choose_strategy(front, dict.fromkeys(KNOWN.problem.objective_names, 1.0), bounds)
     shown = re.search(r'id="shown" data-index="(\d+)"', result.stdout)
     assert shown
     assert int(shown[1]) == expected.index
