@@ -11,7 +11,7 @@ READY = $(VENV)/.ready
 export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
-.PHONY: help demo smoke test test-slow lint bench bench-compare clean
+.PHONY: help demo smoke test test-slow lint docs bench bench-compare clean
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
@@ -39,6 +39,10 @@ lint: $(READY) ## style, types, and the direction of the rooms
 	$(RUN)/ruff check .
 	$(RUN)/mypy
 	$(RUN)/lint-imports
+
+docs: $(READY) ## the documentation as a site, into out/docs; warnings are errors
+	$(RUN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(RUN)/python -m sphinx -W --keep-going -q -b html docs out/docs
 
 bench: $(READY) ## the benchmarks
 	$(RUN)/python benchmarks/exploration.py speed

@@ -322,7 +322,7 @@ def test_the_examples_of_the_help_texts_are_valid_commands():
 
 def test_the_commands_in_the_documentation_are_valid():
     found = 0
-    for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
         for line in re.findall(r"^ *drakerock (.*)$", path.read_text(), re.MULTILINE):
             words = shlex.split(line.split(" > ")[0], comments=True)
             # DIR|TABLE is one of the two, [--out DIR] may be left out, ... stands for more.

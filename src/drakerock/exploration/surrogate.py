@@ -304,7 +304,8 @@ class Surrogate(MultiOutputMixin, RegressorMixin, BaseEstimator):
         config: how to fit.
         seed: seed of the study; the fit is a function of it and of the data only.
 
-    Attributes after `fit`: models_, the fitted `Kriging` models in the objectives' order.
+    Attributes:
+        models_: after `fit`, the fitted `Kriging` models in the objectives' order.
     """
 
     def __init__(
