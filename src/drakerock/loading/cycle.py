@@ -110,6 +110,7 @@ def run_cycle(
         cycle.plan,
         np.array(station.diagram.GetOutputPort("progress").Eval(root)),
         signals,
+        [station.plant.get_body(k).name() for k in station.plant.GetBodyIndices(station.machine.instance)],
         cycle.masses,
         cycle.load,
         debris,
@@ -271,7 +272,7 @@ def save_cycle(result: CycleResult, folder: str | Path) -> list[Path]:
     if result.recording is not None:
         save_recording(result.recording, folder / "recording.npz")
     save_plan(result.plan, result.field, folder / "plan.json")
-    write_text(folder / "scenario.json", result.scenario.model_dump_json(indent=2) + "\n")
+    write_text(folder / "scenario.json", result.scenario.resolve().model_dump_json(indent=2) + "\n")
     write_text(folder / "outcome.json", result.outcome.to_json())
     names = [
         "pile_before.npz",
