@@ -55,7 +55,7 @@ def make_machine_project(folder: Path, name: str, payload: float) -> list[Path]:
         "drift": f"{max(3.9 * factor, 1.5):.2f}",
         "depth": f"{max(1.0 * factor, 0.6):.2f}",
         "height": f"{max(5.0 * factor, LOWEST_ROOF):.2f}",
-        "emission": f"{max(3.3 * factor, 1.2):.2f}",
+        "emission": f"{max(5.0 * factor, LOWEST_ROOF) - 1.7:.2f}",
         "reach": f"{2.6 * factor:.2f}",
     }
     scenario = _write_template("machine", "scenario.yaml", folder, name=name, **values)
@@ -74,7 +74,7 @@ def make_site_project(folder: Path, width: float, height: float) -> list[Path]:
         )
     _require_free(folder, "scenario.yaml")
     reach, depth = 2.6, 1.0
-    emission = height - 1.2
+    emission = height - 1.8  # under the roof, which is 0.5 m lower at the walls
     rocks = round(300 * (width / 3.9) * (height / 5.0))
     values = {"width": width, "height": height, "depth": depth, "rocks": rocks, "emission": emission, "reach": reach}
     return [_write_template("site", "scenario.yaml", folder, **{k: f"{v:g}" for k, v in values.items()})]
