@@ -40,8 +40,8 @@ SeedOption = Annotated[int | None, typer.Option(help="Seed of all randomness.")]
 
 FIRST_STEPS = """drakerock simulates a load-haul-dump machine digging in thousands of rocks. Begin with
 
-  drakerock load studies/small.yaml --out out/small    one loading on a small pile, in seconds; open out/small/replay.html
-  drakerock new machine my_machine --payload 9         your own machine, and likewise: site, study, controller
+  drakerock load studies/small.yaml --out out/small      a loading in seconds; open out/small/replay.html
+  drakerock new machine my_machine --payload 9           your own machine; likewise site, study, controller
   drakerock study run studies/smoke.yaml --out out/smoke   a whole campaign, in miniature
   drakerock --help                                     all commands; each has --help with an example
   drakerock --install-completion                       Tab completes commands and options"""

@@ -30,7 +30,9 @@ def new_machine(
     """
     from drakerock.study.project import make_machine_project
 
-    _tell(make_machine_project(folder, name, 1e3 * payload), f"drakerock machine check {folder}/scenario.yaml")
+    _tell(
+        make_machine_project(folder, name, 1e3 * payload), f"drakerock machine check {folder}/scenario.yaml"
+    )
 
 
 @new_app.command("site")

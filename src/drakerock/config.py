@@ -183,7 +183,11 @@ def _find_files_beside(data: Any, schema: type[BaseModel], folder: Path) -> None
         return
     for key, value in data.items():
         if key in schema.file_fields:
-            data[key] = [_find_beside(v, folder) for v in value] if isinstance(value, list) else _find_beside(value, folder)
+            data[key] = (
+                [_find_beside(v, folder) for v in value]
+                if isinstance(value, list)
+                else _find_beside(value, folder)
+            )
         elif key in schema.model_fields:
             for inner in _find_schemas(schema.model_fields[key].annotation):
                 for item in value if isinstance(value, list) else [value]:

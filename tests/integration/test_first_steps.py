@@ -43,10 +43,14 @@ def test_used_folder_is_refused(tmp_path):
 
 def test_ctrl_c_says_where_it_stopped_and_what_that_means(monkeypatch, capsys):
     monkeypatch.setattr(cli, "console", Console(file=sys.stdout, width=100))
-    with pytest.raises(typer.Exit) as stopped:
+
+    def work() -> None:
         with cli._show_progress("load", "nothing was written to out") as advance:
             advance("s1", None, note="4.2 s simulated")
             raise KeyboardInterrupt
+
+    with pytest.raises(typer.Exit) as stopped:
+        work()
     assert stopped.value.exit_code == 130
     shown = capsys.readouterr().out
     assert "interrupted at: s1, 4.2 s simulated" in shown
@@ -56,7 +60,15 @@ def test_ctrl_c_says_where_it_stopped_and_what_that_means(monkeypatch, capsys):
 @pytest.mark.parametrize("width", [80, 200])
 def test_values_of_a_sequence_take_the_terminals_width(monkeypatch, capsys, width):
     row = {"mean": 300.0, "standard_error": 10.0, "spread": 20.0, "values": [301.0] * 8}
-    names = ("production", "damage", "debris", "bucket_mass_kg", "weighed_mass_kg", "loading_time_s", "energy_J")
+    names = (
+        "production",
+        "damage",
+        "debris",
+        "bucket_mass_kg",
+        "weighed_mass_kg",
+        "loading_time_s",
+        "energy_J",
+    )
     summary = {
         "loadings": 8,
         "strategy": {"alpha": 1.1},
@@ -70,5 +82,3 @@ def test_values_of_a_sequence_take_the_terminals_width(monkeypatch, capsys, widt
     if width == 200:
         assert any("  ".join(["301"] * 8) in line for line in lines)
     assert not any(line.count("301") == 1 for line in lines if "production" in line)
-
-

@@ -1,4 +1,4 @@
-"""`drakerock new`: commented files to begin a machine, site, study or controller of one's own, which run as they are."""
+"""`drakerock new`: commented files to begin a machine, site, study or controller of one's own; they run as they are."""
 
 from __future__ import annotations
 
@@ -28,17 +28,19 @@ def make_machine_project(folder: Path, name: str, payload: float) -> list[Path]:
         InputError: a file of these names is there already, or the folder cannot be written.
     """
     if not name.isidentifier():
-        raise InputError(f"--name {name}: letters, digits and _ only, no digit first: links and files are named so")
+        raise InputError(
+            f"--name {name}: letters, digits and _ only, no digit first: links and files are named so"
+        )
     if not 500 <= payload <= 100_000:
         raise InputError(f"--payload {payload / 1e3:g}: from 0.5 to 100 t")
     _require_free(folder, "design.yaml", "scenario.yaml", f"{name}.sdf")
-    assert SHIPPED_DATA.payload and SHIPPED_DATA.breakout_force and SHIPPED_DATA.critical_moment
-    factor = (payload / SHIPPED_DATA.payload) ** (1 / 3)
+    known = SHIPPED_DATA.model_dump()
+    factor = (payload / known["payload"]) ** (1 / 3)
     design = scale_design(read_text(find_data("models", "lhd", "design.yaml")), factor, name)
     head = (
-        f"# {name}: the shipped LH621-class machine at {factor:.3g} times its size. Put your machine's numbers in place of "
-        "these,\n# and write it again: python -m drakerock.models.make_machine design.yaml (what each number does: docs/"
-        "own_machine.md).\n"
+        f"# {name}: the shipped LH621-class machine at {factor:.3g} times its size. Put your machine's numbers in place\n"
+        "# of these, and write it again: python -m drakerock.models.make_machine design.yaml (what each number does:\n"
+        "# docs/own_machine.md).\n"
     )
     lines = design.split("\n")
     lines = [line for line in lines[1:] if "# Table:" not in line]  # of the LH621 alone
@@ -50,8 +52,8 @@ def make_machine_project(folder: Path, name: str, payload: float) -> list[Path]:
     values = _measure(folder, name) | {
         "factor": f"{factor:.3g}",
         "payload": f"{payload:.0f}",
-        "breakout": f"{SHIPPED_DATA.breakout_force * factor**3:.0f}",
-        "critical": f"{SHIPPED_DATA.critical_moment * factor**3:.0f}",
+        "breakout": f"{known['breakout_force'] * factor**3:.0f}",
+        "critical": f"{known['critical_moment'] * factor**3:.0f}",
         "drift": f"{max(3.9 * factor, 1.5):.2f}",
         "depth": f"{max(1.0 * factor, 0.6):.2f}",
         "height": f"{max(5.0 * factor, LOWEST_ROOF):.2f}",
@@ -70,13 +72,21 @@ def make_site_project(folder: Path, width: float, height: float) -> list[Path]:
     """
     if not (3.4 <= width <= 30 and LOWEST_ROOF <= height <= 20):
         raise InputError(
-            f"--width {width:g} --height {height:g}: 3.4 to 30 m wide (the LH621 needs 3.4) and {LOWEST_ROOF} to 20 m high"
+            f"--width {width:g} --height {height:g}: 3.4 to 30 m wide (the LH621 needs 3.4) and {LOWEST_ROOF} to 20 m "
+            "high"
         )
     _require_free(folder, "scenario.yaml")
     reach, depth = 2.6, 1.0
     emission = height - 1.8  # under the roof, which is 0.5 m lower at the walls
     rocks = round(300 * (width / 3.9) * (height / 5.0))
-    values = {"width": width, "height": height, "depth": depth, "rocks": rocks, "emission": emission, "reach": reach}
+    values = {
+        "width": width,
+        "height": height,
+        "depth": depth,
+        "rocks": rocks,
+        "emission": emission,
+        "reach": reach,
+    }
     return [_write_template("site", "scenario.yaml", folder, **{k: f"{v:g}" for k, v in values.items()})]
 
 

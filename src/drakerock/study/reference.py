@@ -76,7 +76,9 @@ def _allow_one(body: dict[str, Any], item: dict[str, Any]) -> str:
     if kind == "array":
         inner = item.get("items")
         return f"list of {_allow(body, inner)}" if isinstance(inner, dict) else "list"
-    word = {"number": "number", "integer": "whole number", "string": "text", "boolean": "true, false"}.get(kind, kind)
+    word = {"number": "number", "integer": "whole number", "string": "text", "boolean": "true, false"}.get(
+        kind, kind
+    )
     word = {"object": "keys and values", "null": "null"}.get(kind, word)
     signs = (("exclusiveMinimum", ">"), ("minimum", ">="), ("exclusiveMaximum", "<"), ("maximum", "<="))
     bounds = [f"{sign} {item[key]:g}" for key, sign in signs if key in item]

@@ -8,13 +8,17 @@ from drakerock.errors import InputError
 from drakerock.study.job_folder import LOCK, use_folder
 
 
+def enter(folder, *, force=False, sequence=False):
+    with use_folder(folder, force=force, sequence=sequence):
+        pass
+
+
 def test_used_folder_is_refused_and_force_removes_what_a_loading_wrote(tmp_path):
     mine = tmp_path / "notes.txt"
     for path in (mine, tmp_path / "outcome.json", tmp_path / "figure_side.png", tmp_path / "replay.html"):
         path.write_text("x")
     with pytest.raises(InputError, match=r"an earlier loading is there \(outcome.json\); --force"):
-        with use_folder(tmp_path, force=False, sequence=False):
-            pass
+        enter(tmp_path)
     assert len(list(tmp_path.iterdir())) == 4
     with use_folder(tmp_path, force=True, sequence=False):
         assert {path.name for path in tmp_path.iterdir()} == {"notes.txt", LOCK}
@@ -24,16 +28,12 @@ def test_used_folder_is_refused_and_force_removes_what_a_loading_wrote(tmp_path)
 def test_folder_is_one_runs_at_a_time(tmp_path):
     with use_folder(tmp_path, force=False, sequence=True):
         with pytest.raises(InputError, match="another run is working there"):
-            with use_folder(tmp_path, force=True, sequence=True):
-                pass
-    with use_folder(tmp_path, force=False, sequence=True):
-        pass
+            enter(tmp_path, sequence=True)
+    enter(tmp_path, sequence=True)
 
 
 def test_sequence_goes_on_in_its_folder_and_a_loading_does_not_enter_it(tmp_path):
     (tmp_path / "loading_00").mkdir()
-    with use_folder(tmp_path, force=False, sequence=True):
-        pass
+    enter(tmp_path, sequence=True)
     with pytest.raises(InputError, match="a sequence of 1 loadings is there"):
-        with use_folder(tmp_path, force=True, sequence=False):
-            pass
+        enter(tmp_path, force=True)

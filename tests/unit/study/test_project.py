@@ -1,4 +1,4 @@
-"""`drakerock new`: what is written can be used where it lies, is scaled by the stated powers, and overwrites nothing."""
+"""`drakerock new`: what it writes can be used where it lies, is scaled by the stated powers, and overwrites nothing."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_nothing_is_overwritten_and_bad_numbers_are_told(machine, tmp_path):
         make_machine_project(tmp_path, "mine", 9.0)
     with pytest.raises(InputError, match="letters, digits"):
         make_machine_project(tmp_path, "my machine", 9000.0)
-    with pytest.raises(InputError, match="3.4 to 30 m wide"):
+    with pytest.raises(InputError, match=r"3.4 to 30 m wide"):
         make_site_project(tmp_path, 2.0, 5.0)
 
 
@@ -107,7 +107,7 @@ def test_another_machine_keeps_no_number_of_the_shipped_one():
     scenario = load_scenario()
     assert scenario.tau_c == 145e3
     assert scenario.loading.planning.r_ft is None
-    with pytest.raises(InputError, match="machine.expected.critical_moment"):
+    with pytest.raises(InputError, match=r"machine.expected.critical_moment"):
         scenario.replace(**{"machine.model": "package://drakerock/lhd_small/lhd_small.sdf"})
     given = scenario.replace(
         **{
