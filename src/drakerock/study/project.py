@@ -38,7 +38,7 @@ def make_machine_project(folder: Path, name: str, payload: float) -> list[Path]:
     factor = (payload / known["payload"]) ** (1 / 3)
     design = scale_design(read_text(find_data("models", "lhd", "design.yaml")), factor, name)
     head = (
-        f"# {name}: the shipped LH621-class machine at {factor:.3g} times its size. Put your machine's numbers in place\n"
+        f"# {name}: the shipped LH621-class machine at {factor:.3g} times its size. Put your machine's in place\n"
         "# of these, and write it again: python -m drakerock.models.make_machine design.yaml (what each number does:\n"
         "# docs/own_machine.md).\n"
     )

@@ -26,9 +26,11 @@ def test_used_folder_is_refused_and_force_removes_what_a_loading_wrote(tmp_path)
 
 
 def test_folder_is_one_runs_at_a_time(tmp_path):
-    with use_folder(tmp_path, force=False, sequence=True):
-        with pytest.raises(InputError, match="another run is working there"):
-            enter(tmp_path, sequence=True)
+    with (
+        use_folder(tmp_path, force=False, sequence=True),
+        pytest.raises(InputError, match="another run is working there"),
+    ):
+        enter(tmp_path, sequence=True)
     enter(tmp_path, sequence=True)
 
 
