@@ -54,6 +54,7 @@ def make_machine_project(folder: Path, name: str, payload: float) -> list[Path]:
         "payload": f"{payload:.0f}",
         "breakout": f"{known['breakout_force'] * factor**3:.0f}",
         "critical": f"{known['critical_moment'] * factor**3:.0f}",
+        "rocks": f"{round(min(300, 260 * factor**2))}",  # as many as find room under the roof
         "drift": f"{max(3.9 * factor, 1.5):.2f}",
         "depth": f"{max(1.0 * factor, 0.6):.2f}",
         "height": f"{max(5.0 * factor, LOWEST_ROOF):.2f}",
