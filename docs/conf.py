@@ -19,7 +19,9 @@ autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 napoleon_google_docstring = True
 napoleon_use_ivar = True
-napoleon_custom_sections = [(f"{kind} port{s}", "params_style") for kind in ("Input", "Output") for s in ("", "s")]
+napoleon_custom_sections = [
+    (f"{kind} port{s}", "params_style") for kind in ("Input", "Output") for s in ("", "s")
+]
 
 html_theme = "furo"
 html_title = "drakerock"

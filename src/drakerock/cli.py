@@ -17,13 +17,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
+from drakerock.cli_new import new_app
 from drakerock.errors import InputError, RunStopped, SimulationFailure
 
 app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
+    invoke_without_command=True,
     pretty_exceptions_enable=False,
-    help="Simulation-based development of robotic rock loading, built on Drake.",
 )
 console = Console(stderr=True)
 output = Console()
@@ -37,6 +36,35 @@ SetOption = Annotated[
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print only JSON on standard output.")]
 SeedOption = Annotated[int | None, typer.Option(help="Seed of all randomness.")]
+
+
+FIRST_STEPS = """drakerock simulates a load-haul-dump machine digging in thousands of rocks. Begin with
+
+  drakerock load studies/small.yaml --out out/small      a loading in seconds; open out/small/replay.html
+  drakerock new machine my_machine --payload 9           your own machine; likewise site, study, controller
+  drakerock study run studies/smoke.yaml --out out/smoke   a whole campaign, in miniature
+  drakerock --help                                     all commands; each has --help with an example
+  drakerock --install-completion                       Tab completes commands and options"""
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"drakerock {version('drakerock')} (drake {version('drake')})")
+        raise typer.Exit
+
+
+@app.callback()
+def start(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Simulation-based development of robotic rock loading, built on Drake."""
+    if context.invoked_subcommand is None:
+        output.print(Text(FIRST_STEPS), soft_wrap=True)
 
 
 def main() -> None:
@@ -122,6 +150,9 @@ def load(
     meshcat: Annotated[
         bool, typer.Option("--meshcat", help="Show the cycle in a browser while it is computed.")
     ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace the files of an earlier loading in the folder.")
+    ] = False,
     seed: SeedOption = None,
     set_: SetOption = None,
     json_: JsonOption = False,
@@ -132,6 +163,7 @@ def load(
 
     Example: drakerock load studies/small.yaml --loadings 5 --figures --out out/five
     """
+    from drakerock.study.job_folder import use_folder
     from drakerock.study.jobs import run_and_save, run_and_save_sequence
 
     strategy = {"alpha": alpha, "beta": beta, "gamma": gamma, "kappa": kappa}
@@ -142,7 +174,8 @@ def load(
     if meshcat and loadings is not None:
         raise InputError("--meshcat: shows one cycle; leave out --loadings")
     if loadings is not None:
-        with _show_progress("load") as advance:
+        stopped = "loadings that were finished are stored; the same command goes on"
+        with use_folder(out, force=force, sequence=True), _show_progress("load", stopped) as advance:
             summary, paths = run_and_save_sequence(
                 config, loadings, out, advance, replay=replay, figures=figures
             )
@@ -155,7 +188,8 @@ def load(
             raise SimulationFailure(summary["reasons"][-1])
         return
     live = _start_meshcat() if meshcat else None
-    with _show_progress("load") as advance:
+    stopped = f"nothing was written to {out}"
+    with use_folder(out, force=force, sequence=False), _show_progress("load", stopped) as advance:
         result, paths = run_and_save(config, out, advance, replay=replay, figures=figures, meshcat=live)
     if json_:
         print(result.to_json(), end="")
@@ -233,6 +267,7 @@ def machine_show(
     _print_paths([path])
 
 
+app.add_typer(new_app, name="new")
 study_app = typer.Typer(no_args_is_help=True, help="Campaigns: many sequences of loadings, stored.")
 app.add_typer(study_app, name="study")
 WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes [default: one per core].")]
@@ -532,8 +567,12 @@ def _load(path: Path | None, seed: int | None, overrides: list[str] | None) -> A
 
 
 @contextmanager
-def _show_progress(name: str) -> Iterator[Callable[..., None]]:
-    """Show what is being done on standard error; plain (and silent) when that is not a terminal."""
+def _show_progress(name: str, stopped: str = "") -> Iterator[Callable[..., None]]:
+    """Show what is being done on standard error; plain (and silent) when that is not a terminal.
+
+    Ctrl-C is answered with where it stopped, and `stopped`, what that means.
+    """
+    where = name
     columns = (TextColumn("[bold]{task.fields[stage]:<18}"), BarColumn(), TextColumn("{task.fields[note]}"))
     with Progress(
         *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
@@ -541,11 +580,20 @@ def _show_progress(name: str) -> Iterator[Callable[..., None]]:
         task = progress.add_task(name, total=None, stage=name, note="")
 
         def advance(stage: str, share: float | None = None, note: str = "") -> None:
+            nonlocal where
+            where = f"{stage}, {note}" if note else stage
             progress.update(
                 task, stage=stage, total=None if share is None else 1.0, completed=share or 0, note=note
             )
 
-        yield advance
+        try:
+            yield advance
+        except KeyboardInterrupt:
+            progress.stop()
+            console.print(Text(f"interrupted at: {where}"), soft_wrap=True)
+            if stopped:
+                console.print(Text(stopped), soft_wrap=True)
+            raise typer.Exit(130) from None
 
 
 def _print_outcome(outcome: Any) -> None:
@@ -594,7 +642,7 @@ def _print_outcome(outcome: Any) -> None:
 def _print_sequence(summary: dict[str, Any]) -> None:
     strategy = "  ".join(f"{key} {value:g}" for key, value in summary["strategy"].items())
     title = f"{summary['loadings']} loadings, {strategy}"
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", expand=True)
     rows = {
         "production": ("production [kg/s]", "{:.0f}"),
         "damage": ("damage", "{:.4f}"),
@@ -605,9 +653,11 @@ def _print_sequence(summary: dict[str, Any]) -> None:
         "energy_J": ("motors' work [J]", "{:.3g}"),
         "wall_time_s": ("wall time of a cycle [s]", "{:.1f}"),
     }
-    table.add_column("")
-    for heading in ("mean", "standard error", "spread", "values"):
+    table.add_column("", no_wrap=True)
+    for heading in ("mean", "standard error", "spread"):
         table.add_column(heading, justify="right")
+    # The list of values takes what the terminal leaves, and goes on in the next line.
+    table.add_column("values", overflow="fold", ratio=1)
     for name, (label, form) in rows.items():
         row = summary["quantities"][name]
         numbers = [

@@ -81,7 +81,7 @@ def load_config[ConfigT: Config](
     overrides: Sequence[str] = (),
     complete: Callable[[dict[str, Any]], None] | None = None,
 ) -> ConfigT:
-    """Read a YAML file into `schema`.
+    """Read a YAML file into `schema`. A file that it names is looked for beside it first, then from where one works.
 
     Args:
         path: the YAML file; an empty file means all defaults.
@@ -91,7 +91,8 @@ def load_config[ConfigT: Config](
     Raises:
         InputError: unreadable file, YAML syntax, unknown key, value out of range.
     """
-    return parse_config(read_text(Path(path)), schema, overrides, source=str(path), complete=complete)
+    text, folder = read_text(Path(path)), Path(path).parent
+    return parse_config(text, schema, overrides, source=str(path), complete=complete, folder=folder)
 
 
 def parse_config[ConfigT: Config](
@@ -100,14 +101,20 @@ def parse_config[ConfigT: Config](
     overrides: Sequence[str] = (),
     source: str = "<text>",
     complete: Callable[[dict[str, Any]], None] | None = None,
+    folder: Path | None = None,
 ) -> ConfigT:
-    """Parse YAML text into `schema`; `source` is the name used in messages. Otherwise as `load_config`."""
+    """Parse YAML text into `schema`; `source` is the name used in messages, `folder` where files are looked for first.
+
+    Otherwise as `load_config`.
+    """
     document = YamlDocument(text, source)
     data = {} if document.data is None else document.data
     if not isinstance(data, dict):
         raise InputError(
             f"{source}: expected keys and values at the top level, found a {type(data).__name__}"
         )
+    if folder is not None:
+        _find_files_beside(data, schema, folder)
     changes = _apply_overrides(data, overrides)
     if complete:
         complete(data)
@@ -168,6 +175,36 @@ def _apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> dict[Key
         documents = {key: known for key, known in documents.items() if key[: len(path)] != path}
         documents[path] = document
     return documents
+
+
+def _find_files_beside(data: Any, schema: type[BaseModel], folder: Path) -> None:
+    """Put whole paths in place of the names of files that lie in `folder`."""
+    if not isinstance(data, dict) or not issubclass(schema, Config):
+        return
+    for key, value in data.items():
+        if key in schema.file_fields:
+            data[key] = (
+                [_find_beside(v, folder) for v in value]
+                if isinstance(value, list)
+                else _find_beside(value, folder)
+            )
+        elif key in schema.model_fields:
+            for inner in _find_schemas(schema.model_fields[key].annotation):
+                for item in value if isinstance(value, list) else [value]:
+                    _find_files_beside(item, inner, folder)
+
+
+def _find_beside(name: Any, folder: Path) -> Any:
+    if not isinstance(name, str) or "://" in name:
+        return name
+    # A function in a file is named ``file.py:function``.
+    file, colon, function = name.rpartition(".py:")
+    path = folder / (f"{file}.py" if colon else name)
+    try:
+        found = path.is_file()
+    except (OSError, ValueError):
+        return name
+    return f"{path.resolve()}{colon and ':' + function}" if found else name
 
 
 class _Origin:

@@ -5,6 +5,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from drakerock.errors import InputError
 from drakerock.lhd.placement import set_machine_pose
 from drakerock.loading.control import FeedforwardController
 from drakerock.loading.cycle import run_cycle
@@ -140,13 +141,10 @@ def test_wheels_without_grip_slip_as_an_event(small_scenario, pile):
     assert slips[0]["duration_s"] > 0.2
 
 
-def test_drift_too_narrow_has_no_candidate_slice(small_scenario, pile):
+def test_drift_too_narrow_for_the_machine_is_refused(small_scenario, pile):
     wide = with_loading(small_scenario, planning={"wall_clearance": 0.6})
-    outcome = run_cycle(wide, pile).outcome
-    assert outcome.reason.startswith("no candidate slice: the machine")
-    assert outcome.status == "done"
-    assert outcome.phi1 == 0.0
-    assert outcome.steps == 0
+    with pytest.raises(InputError, match=r"site.drift_width: 3.9 m is too narrow .*at least 4.30 m"):
+        run_cycle(wide, pile)
 
 
 def test_scanner_sees_enough_to_dig(small_scenario, pile):

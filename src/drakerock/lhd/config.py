@@ -17,21 +17,37 @@ class MotorConfig(Config):
 
 
 class MachineData(Config):
-    """What `run_machine_checks` expects of the machine; none: the value is reported without judgement."""
+    """What is known of a machine: what `run_machine_checks` expects of it, and what its loadings are judged by."""
 
-    total_mass: float | None = Field(default=60580.0, gt=0, description="[kg]")
-    payload: float = Field(default=21000.0, gt=0, description="mass the boom has to lift at the bucket [kg]")
-    heaped_capacity: float | None = Field(default=8.0, gt=0, description="heaped bucket volume [m^3]")
-    breakout_force: float | None = Field(
-        default=378e3, gt=0, description="vertical tip force, chassis held [N]"
+    total_mass: float | None = Field(default=None, gt=0, description="[kg]")
+    payload: float | None = Field(
+        default=None,
+        gt=0,
+        description="mass the boom has to lift at the bucket [kg]; `machine check` needs it",
     )
-    reach: float | None = Field(default=4.24, gt=0, description="r_ft at the slope below [m]")
+    heaped_capacity: float | None = Field(default=None, gt=0, description="heaped bucket volume [m^3]")
+    breakout_force: float | None = Field(
+        default=None, gt=0, description="vertical tip force, chassis held [N]"
+    )
+    reach: float | None = Field(default=None, gt=0, description="r_ft at the slope below [m]")
     reach_slope_deg: float = Field(
         default=40.0, gt=0, lt=80, description="slope at which r_ft is taken [deg]"
     )
     critical_moment: float | None = Field(
-        default=145e3, gt=0, description="tau_c of the damage measure, for comparison only [N m]"
+        default=None, gt=0, description="tau_c of the damage measure: what the bucket's hinge may carry [N m]"
     )
+
+
+SHIPPED_MODEL = "package://drakerock/lhd/lhd.sdf"
+SHIPPED_DATA = MachineData(
+    total_mass=60580.0,
+    payload=21000.0,
+    heaped_capacity=8.0,
+    breakout_force=378e3,
+    reach=4.24,
+    critical_moment=145e3,
+)
+"""Of the method's LH621-class machine (sections 2 and 5)."""
 
 
 class MachineConfig(Config):
@@ -40,7 +56,7 @@ class MachineConfig(Config):
     file_fields = ("model",)
 
     model: str = Field(
-        default="package://drakerock/lhd/lhd.sdf",
+        default=SHIPPED_MODEL,
         description="the SDFormat file: a path, or package://drakerock/...",
     )
     wheel: MotorConfig = MotorConfig()
@@ -50,6 +66,17 @@ class MachineConfig(Config):
         default=None, gt=0, description="velocity gain of the three motors [N m s/rad]; none: as in the file"
     )
     steering_angle_deg: float = Field(
-        default=0.0, ge=-45, le=45, description="angle held at the articulation, positive turns left [deg]"
+        default=0.0,
+        ge=-45,
+        le=45,
+        description="angle held at the articulation: the rear unit's, so that negative turns left [deg]",
     )
     expected: MachineData = MachineData()
+
+    @property
+    def data(self) -> MachineData:
+        """`expected`; of the shipped machine with the method's values where that is silent."""
+        if self.model != SHIPPED_MODEL:
+            return self.expected
+        given = self.expected.model_dump(exclude_none=True, exclude={"reach_slope_deg"})
+        return SHIPPED_DATA.replace(**given, reach_slope_deg=self.expected.reach_slope_deg)

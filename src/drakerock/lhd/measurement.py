@@ -25,10 +25,13 @@ MEASUREMENT: dict[str, str] = {
     "wheel_rate": "rad/s",
     "v_F": "m/s",
     "pitch_F": "rad",
+    "y_F": "m",
+    "yaw_F": "rad",
+    "articulation": "rad",
 }
 """The measurement's elements in order, with their units: the tip's position in W, the bucket's pitch to the floor
 (nose-up positive), boom and bucket angle and their rates, the wheels' mean rate, the front unit's forward speed
-and pitch (nose-up positive)."""
+and pitch (nose-up positive), its y in W, its heading to the left, and the articulation's angle."""
 
 
 class MachineSensor(LeafSystem):
@@ -57,6 +60,7 @@ class MachineSensor(LeafSystem):
         position, velocity = _find_starts(plant, machine)
         self._angles = [position["boom_joint"], position["bucket_joint"]]
         self._rates = [n_q + velocity[name] for name in ("boom_joint", "bucket_joint")]
+        self._articulation = position["articulation"]
         self._wheels = [n_q + velocity[name] for name in names.WHEEL_JOINTS]
         self._poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
         self._velocities = self.DeclareAbstractInputPort(
@@ -74,7 +78,8 @@ class MachineSensor(LeafSystem):
         p_WT = X_WB.multiply(self._p_BT)
         phi_l, phi_b = state[self._angles]
         # Drake's pitch is about +y, nose-down for a body whose x points forward.
-        pitch_F = -RollPitchYaw(X_WF.rotation()).pitch_angle()
+        attitude = RollPitchYaw(X_WF.rotation())
+        pitch_F = -attitude.pitch_angle()
         v_WF = self._velocities.Eval(context)[self._front].translational()
         output.SetFromVector(
             [
@@ -86,6 +91,9 @@ class MachineSensor(LeafSystem):
                 float(np.mean(state[self._wheels])),
                 float(v_WF @ X_WF.rotation().col(0)),
                 pitch_F,
+                float(X_WF.translation()[1]),
+                attitude.yaw_angle(),
+                float(state[self._articulation]),
             ]
         )
 

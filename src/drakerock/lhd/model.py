@@ -83,7 +83,12 @@ def add_machine(plant: MultibodyPlant, config: MachineConfig) -> Machine:
 
 
 def calc_motor_targets(
-    plant: MultibodyPlant, machine: Machine, wheel: float, boom: float, bucket: float
+    plant: MultibodyPlant,
+    machine: Machine,
+    wheel: float,
+    boom: float,
+    bucket: float,
+    steering_angle: float | None = None,
 ) -> np.ndarray:
     """Return the desired state [q, v] for ``plant.get_desired_state_input_port(machine.instance)``.
 
@@ -91,6 +96,7 @@ def calc_motor_targets(
         plant: the finalized plant.
         machine: the machine in it.
         wheel, boom, bucket: wanted joint rates [rad/s]; clamped to the motors' velocity limits.
+        steering_angle: wanted angle of the articulation [rad]; none: the machine's.
 
     Returns:
         (2 n,) positions (only the articulation's counts) and velocities of the n actuators, in Drake's order.
@@ -105,7 +111,9 @@ def calc_motor_targets(
         plant.get_joint_actuator(index).joint().name()
         for index in plant.GetJointActuatorIndices(machine.instance)
     ]
-    positions = [machine.steering_angle if name == "articulation" else 0.0 for name in joints]
+    if steering_angle is None:
+        steering_angle = machine.steering_angle
+    positions = [steering_angle if name == "articulation" else 0.0 for name in joints]
     return np.array(positions + [rates.get(name, wheel) for name in joints])
 
 

@@ -61,7 +61,14 @@ class PlanningConfig(Config):
         None
     )
     v_x_max: Annotated[float, Field(gt=0, le=5, description="forward and reverse speed [m/s]")] = 1.3
-    r_ft: Annotated[float, Field(gt=0, le=20, description="reach that scales the dig height, h_p [m]")] = 4.24
+    r_ft: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            le=20,
+            description="reach that scales the dig height, h_p [m]; null: the machine's, at 40 deg",
+        ),
+    ] = None
     tilt_rate: Annotated[float, Field(gt=0, le=3, description="bucket's rate on [s2, s3] [rad/s]")] = 0.5
     ramp: Annotated[
         float,
@@ -88,10 +95,36 @@ class ControlConfig(Config):
     approach_time: Annotated[float, Field(gt=0, description="allowed from the start to s0 [s]")] = 20.0
 
 
+class SteeringConfig(Config):
+    """Articulation steering: holds the plan's line across the drift."""
+
+    hold_line: Annotated[
+        bool,
+        Field(
+            description="steer back to the plan's line; false: the angle machine.steering_angle_deg is held"
+        ),
+    ] = False
+    preview: Annotated[
+        float, Field(ge=0.5, le=50, description="way over which offset and heading decay [m]")
+    ] = 4.0
+    limit_deg: Annotated[float, Field(gt=0, le=45, description="largest angle of the articulation [deg]")] = (
+        15.0
+    )
+    rate_deg: Annotated[float, Field(gt=0, le=60, description="largest rate of the articulation [deg/s]")] = (
+        8.0
+    )
+    least_speed: Annotated[
+        float, Field(ge=0, le=1, description="slower than this the angle is held: tyres would scrub [m/s]")
+    ] = 0.1
+
+
 class PerformanceConfig(Config):
     """Objectives and events."""
 
-    tau_c: Annotated[float, Field(gt=0, description="critical hinge moment [N m]")] = 145e3
+    tau_c: Annotated[
+        float | None,
+        Field(gt=0, description="critical hinge moment [N m]; null: machine.expected.critical_moment"),
+    ] = None
     t_char: Annotated[float, Field(gt=0, description="characteristic time of the damage integral [s]")] = 12.0
     settle_time: Annotated[
         float, Field(ge=0, le=60, description="at most this long after s4 for the rocks to rest [s]")
@@ -116,6 +149,9 @@ class PerformanceConfig(Config):
         float, Field(gt=0, description="slip event: |v_wheel - v| / v_x_max above this")
     ] = 0.5
     event_time: Annotated[float, Field(ge=0, description="shortest stall or slip that counts [s]")] = 0.2
+    wall_gap: Annotated[
+        float, Field(ge=0, description="contacts with a wall that are less apart are one event [s]")
+    ] = 0.5
 
 
 class PartConfig(Config):
@@ -150,5 +186,6 @@ class LoadingConfig(Config):
     sensing: SensingConfig = SensingConfig()
     planning: PlanningConfig = PlanningConfig()
     control: ControlConfig = ControlConfig()
+    steering: SteeringConfig = SteeringConfig()
     performance: PerformanceConfig = PerformanceConfig()
     parts: PartsConfig = PartsConfig()

@@ -115,6 +115,7 @@ def run_cycle(
         cycle.plan,
         np.array(station.diagram.GetOutputPort("progress").Eval(root)),
         signals,
+        [station.plant.get_body(k).name() for k in station.plant.GetBodyIndices(station.machine.instance)],
         cycle.masses,
         cycle.load,
         debris,
@@ -281,7 +282,7 @@ def save_cycle(result: CycleResult, folder: str | Path) -> list[Path]:
     save_plan(result.plan, result.field, folder / "plan.json")
     if result.field_after is not None:
         save_height_fields(result.field, result.field_after, folder / HEIGHT_FIELDS)
-    write_text(folder / "scenario.json", result.scenario.model_dump_json(indent=2) + "\n")
+    write_text(folder / "scenario.json", result.scenario.resolve().model_dump_json(indent=2) + "\n")
     write_text(folder / "outcome.json", result.outcome.to_json())
     names = [
         "pile_before.npz",

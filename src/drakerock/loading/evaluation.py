@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ def make_outcome(
     plan: DigPlan | NoPlan,
     controller: Array,
     signals: dict[str, Array],
+    parts: Sequence[str],
     masses: Array,
     in_bucket: NDArray[np.bool_],
     debris: NDArray[np.bool_],
@@ -38,6 +40,7 @@ def make_outcome(
         plan: what was planned.
         controller: the tracker's progress, see `SegmentTracker`.
         signals: columns of all steps.
+        parts: names of the machine's bodies.
         masses: (n,) of the rocks [kg].
         in_bucket, debris: (n,) the load at t4, and what was left loose on the floor.
         weighing: the machine on the scale, if it came to that.
@@ -58,7 +61,14 @@ def make_outcome(
     else:
         reason = "s4 timed out" if controller[TIMEOUTS][Mode.S3] else "s4 reached"
         loading_time = float(times[4] - times[0])
-        damage = calc_damage(time, signals["hinge_moment"], times[0], times[4], scenario.loading.performance)
+        damage = calc_damage(
+            time,
+            signals["hinge_moment"],
+            times[0],
+            times[4],
+            scenario.tau_c,
+            scenario.loading.performance.t_char,
+        )
         phi = (-load / loading_time, damage, float(masses[debris].sum()))
     peak = mean = energy = None
     if np.all(np.isfinite(times)):
@@ -69,7 +79,9 @@ def make_outcome(
             np.interp(times[4], time, signals["work"]) - np.interp(times[0], time, signals["work"])
         )
     config = scenario.loading
-    events = find_events(signals, controller[TIMEOUTS], times, config.performance, config.planning.v_x_max)
+    events = find_events(
+        signals, controller[TIMEOUTS], times, config.performance, config.planning.v_x_max, parts
+    )
     if weighing:
         events += find_weighing_events(weighing, load, config.performance.weighing_tolerance)
     if not at_rest and failure is None:

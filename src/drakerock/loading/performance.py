@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,19 +29,20 @@ def find_bucket_load(pile: PileState, bucket: BucketGeometry, X_WB: RigidTransfo
     return inside & (np.abs(p_BRs[:, 1]) <= 0.5 * bucket.inner_width) & ~pile.fixed
 
 
-def calc_damage(time: Array, moment: Array, start: float, end: float, config: PerformanceConfig) -> float:
+def calc_damage(time: Array, moment: Array, start: float, end: float, tau_c: float, t_char: float) -> float:
     """Return phi2 = 1/t_char * integral over [start, end] of max(|tau| - tau_c, 0) / tau_c dt (section 5).
 
     Args:
         time: (k,) step times, evenly spaced [s].
         moment: (k,) bending and twisting moment of the bucket hinge over the step that begins then [N m].
         start, end: t0 and t4 [s].
-        config: tau_c, t_char.
+        tau_c: critical moment [N m].
+        t_char: characteristic time [s].
     """
-    excess = np.maximum(np.abs(moment) - config.tau_c, 0.0) / config.tau_c
+    excess = np.maximum(np.abs(moment) - tau_c, 0.0) / tau_c
     step = float(np.median(np.diff(time)))
     inside = (time >= start - 1e-9) & (time < end - 1e-9)
-    return float(np.sum(excess[inside]) * step / config.t_char)
+    return float(np.sum(excess[inside]) * step / t_char)
 
 
 @dataclass(frozen=True)
@@ -120,8 +122,9 @@ def find_events(
     waypoint_times: Array,
     config: PerformanceConfig,
     v_x_max: float,
+    parts: Sequence[str],
 ) -> list[dict[str, Any]]:
-    """Return stalls, slips and time-outs in the order of their times; none of them ends a cycle.
+    """Return stalls, slips, wall contacts and time-outs in the order of their times; none of them ends a cycle.
 
     Args:
         signals: columns of the cycle.
@@ -129,26 +132,58 @@ def find_events(
         waypoint_times: (5,) t0 to t4 [s].
         config: thresholds.
         v_x_max: scale of the slip threshold [m/s].
+        parts: names of the machine's bodies, in the order that `wall_part` counts.
 
     Returns:
-        One dict each: ``event`` (stall, slip, timeout), ``time_s``, and ``duration_s`` or ``waypoint``.
+        One dict each: ``event`` (stall, slip, wall contact, timeout), ``time_s``, and ``duration_s`` or ``waypoint``; a
+        wall contact has ``part`` (that was pressed hardest) and ``force_N`` (the largest) as well.
     """
     time = signals["time"]
     told = np.abs(signals["target_wheel_rate"]) > 1e-9
     driving = told & (signals["mode"] >= 1)
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     found: list[dict[str, Any]] = []
     for name, mask in (
         ("stall", driving & (np.abs(signals["v_F"]) < config.stall_speed)),
         ("slip", told & (np.abs(signals["wheel_slip"]) > config.slip_ratio * v_x_max)),
     ):
-        edges = np.diff(np.concatenate([[False], mask, [False]]).astype(int))
-        step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-        for first, last in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+        for first, last in _find_runs(mask):
             duration = (last - first) * step
             # Shorter than this it is the start or the turn of the drive, not an event.
             if duration >= config.event_time:
                 found.append({"event": name, "time_s": float(time[first]), "duration_s": float(duration)})
+    found += _find_wall_contacts(signals, config.wall_gap, step, parts)
     for k, late in enumerate(timeouts):
         if late:
             found.append({"event": "timeout", "time_s": float(waypoint_times[k]), "waypoint": f"s{k}"})
     return sorted(found, key=lambda item: item["time_s"])
+
+
+def _find_wall_contacts(
+    signals: dict[str, Array], gap: float, step: float, parts: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Return the machine's contacts with walls, roof and rear wall; those less than `gap` [s] apart are one."""
+    time, force = signals["time"], signals["wall_force"]
+    touching = force > 0.0
+    for first, last in list(_find_runs(~touching)):
+        if first > 0 and last < len(time) and (last - first) * step < gap:
+            touching[first:last] = True
+    found = []
+    for first, last in _find_runs(touching):
+        hardest = first + int(np.argmax(force[first:last]))
+        found.append(
+            {
+                "event": "wall contact",
+                "time_s": float(time[first]),
+                "duration_s": float((last - first) * step),
+                "part": parts[int(signals["wall_part"][hardest])],
+                "force_N": float(force[hardest]),
+            }
+        )
+    return found
+
+
+def _find_runs(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Return first and one past the last index of each run of true values."""
+    edges = np.diff(np.concatenate([[False], mask, [False]]).astype(int))
+    return zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True)

@@ -12,6 +12,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem, State
 from scipy.optimize import brentq
 
+from drakerock.errors import InputError
 from drakerock.lhd.geometry import BucketGeometry, calc_heaped_capacity
 from drakerock.lhd.kinematics import (
     Kinematics,
@@ -19,6 +20,7 @@ from drakerock.lhd.kinematics import (
     calc_full_tilt,
     calc_joint_angles,
     calc_pitch,
+    calc_reach,
     calc_tip,
 )
 from drakerock.loading.config import PlanningConfig, SensingConfig, StrategyConfig
@@ -26,6 +28,10 @@ from drakerock.loading.field import HeightField, PileProfile, calc_pile_profile
 from drakerock.loading.plan import DigPlan, NoPlan, SpeedTable, calc_motor_rates
 
 Array = NDArray[np.float64]
+
+
+REACH_SLOPE_DEG = 40.0
+"""Slope at which the reach r_ft is taken where none is given: it hardly depends on it [deg]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +47,15 @@ class DiggingMachine:
     kinematics: Kinematics
     bucket: BucketGeometry
     width: float
+
+    def check_room(self, drift_width: float, wall_clearance: float) -> None:
+        """Raise InputError if the machine does not fit between the walls of a drift so wide [m]."""
+        least = self.width + 2 * wall_clearance
+        if drift_width < least:
+            raise InputError(
+                f"site.drift_width: {drift_width:g} m is too narrow for the machine, {self.width:.2f} m wide; "
+                f"{wall_clearance:g} m stay free at each wall (loading.planning.wall_clearance); at least {least:.2f} m"
+            )
 
     def calc_outline(self) -> Array:
         """Return the bucket's side profile (k, 2) relative to its tip, at pitch 0 [m]."""
@@ -170,7 +185,8 @@ def make_dig_plan(
     near = np.isfinite(profile.slope) & (np.abs(profile.y - y) <= 0.5 * width)
     slope = float(np.mean(profile.slope[near]))
     x_s0 = float(np.min(profile.x_front[near])) - 0.5 * field.cell
-    h_s2 = float(strategy.beta * config.r_ft * np.sin(slope))
+    r_ft = config.r_ft or calc_reach(kin, np.radians(REACH_SLOPE_DEG))
+    h_s2 = float(strategy.beta * r_ft * np.sin(slope))
 
     # The tip enters at the clearance above the floor, so that much less is left to lift.
     lift_height = max(h_s2 - config.floor_clearance, 0.0)

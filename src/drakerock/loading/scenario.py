@@ -38,6 +38,26 @@ class Scenario(Config):
     loading: LoadingConfig = LoadingConfig()
     recording: RecordingConfig = RecordingConfig()
 
+    @property
+    def tau_c(self) -> float:
+        """The critical moment of the bucket's hinge [N m]: `performance.tau_c`, or the machine's."""
+        tau_c = self.loading.performance.tau_c or self.machine.data.critical_moment
+        assert tau_c is not None, "checked"
+        return tau_c
+
+    def resolve(self) -> Scenario:
+        """Return it with what it derives from the machine written out, as it is stored beside results."""
+        return self.replace(**{"loading.performance.tau_c": self.tau_c})
+
+    @model_validator(mode="after")
+    def _check_critical_moment(self) -> Scenario:
+        if self.loading.performance.tau_c is None and self.machine.data.critical_moment is None:
+            raise ValueError(
+                f"machine.expected.critical_moment: what moment the bucket's hinge of {self.machine.model} may carry "
+                "is not known, and the damage measure needs it; give it here [N m], or as loading.performance.tau_c"
+            )
+        return self
+
     @model_validator(mode="after")
     def _check_emitter(self) -> Scenario:
         top = self.pile.emission_top

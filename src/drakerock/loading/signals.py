@@ -8,6 +8,7 @@ from pydrake.systems.framework import Context
 
 from drakerock.lhd.measurement import MEASUREMENT
 from drakerock.lhd.names import WHEEL_JOINTS
+from drakerock.lhd.wall_contact import WALL_CONTACT
 from drakerock.loading.station import Station
 from drakerock.rocks.drake.interface import ROCK_SUMMARY
 
@@ -48,6 +49,7 @@ def calc_signals(station: Station, root_context: Context) -> tuple[dict[str, Arr
         data[name] = np.concatenate([data[name][:, 1:], data[name][:, -1:]], axis=1)
     add(dict.fromkeys(FORCE_NAMES[:3], "N m") | dict.fromkeys(FORCE_NAMES[3:], "N"), data["bucket_force"])
     add(ROCK_SUMMARY, data["rock_summary"])
+    add(WALL_CONTACT, data["wall_contact"])
 
     plant, instance = station.plant, station.machine.instance
     n_q = plant.num_positions(instance)

@@ -27,6 +27,7 @@ from drakerock.lhd.measurement import add_machine_sensor
 from drakerock.lhd.model import Machine, add_machine, calc_motor_targets
 from drakerock.lhd.placement import set_machine_pose
 from drakerock.lhd.rocks import add_lhd_rocks
+from drakerock.lhd.wall_contact import add_wall_contact
 from drakerock.loading.control import FeedforwardController
 from drakerock.loading.field import HeightField
 from drakerock.loading.parts import MakePart, StationView, connect_inputs, make_part
@@ -36,6 +37,7 @@ from drakerock.loading.planning import DiggingMachine, DigPlanner
 from drakerock.loading.scenario import Scenario
 from drakerock.loading.segments import SegmentTracker
 from drakerock.loading.sensing import PileSensor
+from drakerock.loading.steering import LineSteering
 from drakerock.rocks.drake.drift import AddDrift
 from drakerock.rocks.drake.interface import RockSystem
 from drakerock.rocks.drake.plant import add_plant
@@ -122,9 +124,12 @@ class Station:
 
 
 class MotorTargets(LeafSystem):
-    """Orders the controller's three speeds as the plant's desired state.
+    """Orders the controller's three speeds and the steering angle as the plant's desired state.
 
-    Input port ``motor_speeds``: (3,) wheels, boom, bucket [rad/s].
+    Input ports:
+        ``motor_speeds``: (3,) wheels, boom, bucket [rad/s].
+        ``steering_angle``: (1,) of the articulation [rad]; unconnected: the machine's.
+
     Output port ``desired_state``: as the plant's desired-state port of the machine wants it.
     """
 
@@ -134,11 +139,14 @@ class MotorTargets(LeafSystem):
         self.set_name("motor_targets")
         self._plant, self._machine = plant, machine
         self._speeds = self.DeclareVectorInputPort("motor_speeds", 3)
+        self._angle = self.DeclareVectorInputPort("steering_angle", 1)
         size = len(calc_motor_targets(plant, machine, 0.0, 0.0, 0.0))
-        self.DeclareVectorOutputPort("desired_state", size, self._calc, {self._speeds.ticket()})
+        self.DeclareVectorOutputPort("desired_state", size, self._calc, {self.all_input_ports_ticket()})
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(calc_motor_targets(self._plant, self._machine, *self._speeds.Eval(context)))
+        angle = float(self._angle.Eval(context)[0]) if self._angle.HasValue(context) else None
+        wheel, boom, bucket = (float(speed) for speed in self._speeds.Eval(context))
+        output.SetFromVector(calc_motor_targets(self._plant, self._machine, wheel, boom, bucket, angle))
 
 
 def make_station(
@@ -192,6 +200,7 @@ def make_station(
     )  # fmt: skip
     machine_sensor = add_machine_sensor(builder, plant, machine, digger.kinematics)
     hinge = add_hinge_moment(builder, plant, machine)
+    walls = add_wall_contact(builder, plant, scene_graph, machine)
 
     view = StationView(scenario, plant, scene_graph, machine, digger, shapes)
     parts = loading.parts
@@ -231,10 +240,19 @@ def make_station(
         connect_inputs(builder, "tracker", tracker, signals)
     motor_speeds = controller_system.GetOutputPort("motor_speeds")
     builder.Connect(motor_speeds, motors.GetInputPort("motor_speeds"))
+    if loading.steering.hold_line and not controller_system.HasOutputPort("steering_angle"):
+        steering = builder.AddSystem(LineSteering(plant, machine, loading.steering))
+        connect_inputs(builder, "steering", steering, signals | {"motor_speeds": motor_speeds})
+        builder.Connect(steering.GetOutputPort("steering_angle"), motors.GetInputPort("steering_angle"))
+    elif controller_system.HasOutputPort("steering_angle"):
+        builder.Connect(
+            controller_system.GetOutputPort("steering_angle"), motors.GetInputPort("steering_angle")
+        )
 
     signals |= {
         "motor_speeds": motor_speeds,
         "torques": plant.get_net_actuation_output_port(machine.instance),
+        "wall_contact": walls.GetOutputPort("wall_contact"),
     }
     logs = {}
     for name in LOGGED:
@@ -266,6 +284,7 @@ def make_station(
 
 LOGGED = (
     "measurement", "motor_speeds", "mode", "torques", "machine_state", "hinge_moment", "bucket_force", "rock_summary",
+    "wall_contact",
 )  # fmt: skip
 """Signals that are logged in every step."""
 EXPORTED = ("measurement", "plan", "height_field", "mode", "progress", "motor_speeds", "pile", "bucket_force")
@@ -287,6 +306,7 @@ def _make_sensor(view: StationView) -> PileSensor:
 def _make_planner(view: StationView) -> DigPlanner:
     loading = view.scenario.loading
     source = loading.planning.source
+    view.digger.check_room(view.scenario.site.drift_width, loading.planning.wall_clearance)
     return DigPlanner(
         loading.strategy,
         view.digger,

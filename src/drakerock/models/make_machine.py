@@ -178,6 +178,7 @@ class Writer:
     def add_linkage(self) -> None:
         """Add the links and cylinders behind boom and bucket, closed by ball constraints."""
         reference = self.calc_reference()
+        steel = make_proximity(self.design["steel"])
         for name, spec in self.design["links"].items():
             parent, *base = spec["base"]
             X_WP = reference[parent]
@@ -190,16 +191,18 @@ class Writer:
                 end_body, *end = spec["end"]
                 prisms = make_rod_prisms(apply(np.linalg.inv(X_WN), apply(reference[end_body], end)))
             body = {"mass": spec["mass"], "prisms": prisms}
-            self.add_body(name, pose_of(parent, np.linalg.inv(X_WP) @ X_WN), body, "")
+            self.add_body(name, pose_of(parent, np.linalg.inv(X_WP) @ X_WN), body, steel)
             self.add_joint(f"{name}_joint", "revolute", parent, name, "0 1 0")
             if "end" in spec:
                 end_body, *end = spec["end"]
                 p_NE = apply(np.linalg.inv(X_WN), apply(reference[end_body], end))
                 self.add_loop(name, p_NE, end_body, end)
         for name, spec in self.design["cylinders"].items():
-            self.add_cylinder(name, spec, reference)
+            self.add_cylinder(name, spec, reference, steel)
 
-    def add_cylinder(self, name: str, spec: dict[str, Any], reference: dict[str, np.ndarray]) -> None:
+    def add_cylinder(
+        self, name: str, spec: dict[str, Any], reference: dict[str, np.ndarray], steel: str
+    ) -> None:
         """Add a cylinder's barrel, rod, joints and closure; the rod's limits are the cylinder's stops."""
         parent, *base = spec["base"]
         end_body, *end = spec["end"]
@@ -216,16 +219,16 @@ class Writer:
                 f"{name}: the reference pose needs {length:.3f} m, the stops are {spec['length']}"
             )
         tube = shortest - 0.12
-        barrel = [{"color": "dark", "tube": spec["radius"][0], "z": [0.0, tube]}]
-        rod = [{"color": "chrome", "tube": spec["radius"][1], "z": [tube - longest, 0.0]}]
+        barrel = [{"color": "dark", "tube": spec["radius"][0], "z": [0.0, tube], "collision": True}]
+        rod = [{"color": "chrome", "tube": spec["radius"][1], "z": [tube - longest, 0.0], "collision": True}]
         self.add_body(f"{name}_barrel", pose_of(parent, np.linalg.inv(reference[parent]) @ X_WC),
-                      {"mass": spec["mass"][0], "prisms": barrel}, "")  # fmt: skip
+                      {"mass": spec["mass"][0], "prisms": barrel}, steel)  # fmt: skip
         self.add_joint(f"{name}_barrel_joint", "revolute", parent, f"{name}_barrel", "0 1 0")
         self.add_body(
             f"{name}_rod",
             pose(f"{name}_barrel", [0, 0, length]),
             {"mass": spec["mass"][1], "prisms": rod},
-            "",
+            steel,
         )
         self.add_joint(f"{name}_rod_joint", "prismatic", f"{name}_barrel", f"{name}_rod", "0 0 1",
                        (shortest - length, longest - length), damping=spec["damping"])  # fmt: skip
@@ -255,7 +258,7 @@ class Writer:
             by_color.setdefault(prism["color"], []).extend(meshes)
             solids.extend(meshes)
             if prism.get("collision"):
-                for mesh in meshes:
+                for mesh in make_prisms(prism, sides=8) if "tube" in prism else meshes:
                     file = f"{name}_{collisions.count('declare_convex') + 1}.obj"
                     collisions += (
                         f'<collision name="{file[:-4]}"><geometry><mesh><drake:declare_convex/>'
@@ -354,15 +357,15 @@ def make_disc(x: float, z: float, radius: float, sides: int = 28) -> list[list[f
     return np.stack([x + radius * np.cos(angle), z + radius * np.sin(angle)], axis=1).tolist()
 
 
-def make_prisms(prism: dict[str, Any]) -> list[Mesh]:
-    """Return the meshes of one entry of a body's `prisms`."""
+def make_prisms(prism: dict[str, Any], sides: int = 20) -> list[Mesh]:
+    """Return the meshes of one entry of a body's `prisms`; a tube has so many sides, on its circle."""
     if "tube" in prism:
-        ring = np.array(make_disc(0, 0, prism["tube"], sides=20))
+        ring = np.array(make_disc(0, 0, prism["tube"], sides=sides))
         return [trimesh.convex.convex_hull(np.array([[x, y, z] for z in prism["z"] for x, y in ring]))]
     polygon = make_disc(*prism["disc"]) if "disc" in prism else prism["xz"]
     y = prism["y"]
-    sides = [y, [-y[1], -y[0]]] if prism.get("mirror") else [y]
-    return [make_prism(polygon, side) for side in sides]
+    spans = [y, [-y[1], -y[0]]] if prism.get("mirror") else [y]
+    return [make_prism(polygon, span) for span in spans]
 
 
 def make_bucket_prisms(bucket: dict[str, Any]) -> list[dict[str, Any]]:
@@ -395,7 +398,7 @@ def make_rod_prisms(p_end: np.ndarray) -> list[dict[str, Any]]:
     across = 0.09 * np.array([-along[1], along[0]]) / np.linalg.norm(along)
     polygon = [across, along + across, along - across, -across]
     return [
-        {"color": "yellow", "xz": [p.tolist() for p in polygon], "y": [-0.07, 0.07]},
+        {"color": "yellow", "xz": [p.tolist() for p in polygon], "y": [-0.07, 0.07], "collision": True},
         {"color": "steel", "disc": [0.0, 0.0, 0.12], "y": [-0.12, 0.12]},
         {"color": "steel", "disc": [float(along[0]), float(along[1]), 0.12], "y": [-0.12, 0.12]},
     ]

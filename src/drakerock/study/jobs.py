@@ -78,7 +78,6 @@ def run_and_save(
     )
     progress("writing", None)
     paths = save_cycle(result, folder)
-    (folder / "replay.html").unlink(missing_ok=True)  # an earlier cycle's
     if result.recording is not None:
         if replay:
             write_replay(result.recording, folder / "replay.html")

@@ -19,22 +19,24 @@ from drakerock.loading.performance import (
 from drakerock.rocks.config import SiteConfig
 
 CONFIG = PerformanceConfig()
+TAU_C = 145e3
+PARTS = ("front_unit", "rear_unit", "bucket")
 
 
 @given(moment=st.floats(0, 1e6), start=st.floats(0, 4), length=st.floats(0.5, 5))
 def test_damage_of_a_constant_moment(moment, start, length):
     time = np.arange(0, 12, 0.01)
     start, end = round(start, 2), round(start + length, 2)
-    expected = max(moment - CONFIG.tau_c, 0) / CONFIG.tau_c * (end - start) / CONFIG.t_char
-    damage = calc_damage(time, np.full_like(time, moment), start, end, CONFIG)
+    expected = max(moment - TAU_C, 0) / TAU_C * (end - start) / CONFIG.t_char
+    damage = calc_damage(time, np.full_like(time, moment), start, end, TAU_C, CONFIG.t_char)
     assert damage == pytest.approx(expected, rel=0.03, abs=1e-12)
 
 
 def test_damage_counts_only_the_excess_inside_the_window():
     time = np.arange(0, 10, 0.01)
-    moment = np.where((time > 3) & (time < 4), 3 * CONFIG.tau_c, 0.9 * CONFIG.tau_c)
-    assert calc_damage(time, moment, 0, 10, CONFIG) == pytest.approx(2 * 0.99 / 12, rel=0.02)
-    assert calc_damage(time, moment, 5, 10, CONFIG) == 0.0
+    moment = np.where((time > 3) & (time < 4), 3 * TAU_C, 0.9 * TAU_C)
+    assert calc_damage(time, moment, 0, 10, TAU_C, CONFIG.t_char) == pytest.approx(2 * 0.99 / 12, rel=0.02)
+    assert calc_damage(time, moment, 5, 10, TAU_C, CONFIG.t_char) == 0.0
 
 
 def test_load_is_what_lies_in_the_bucket_at_any_pose(heap, digger):
@@ -97,12 +99,40 @@ def test_events_have_times_and_do_not_count_turns():
         "target_wheel_rate": told,
         "v_F": np.where(np.abs(time - 5) < 0.05, 0.0, speed),
         "wheel_slip": slip,
+        "wall_force": np.zeros_like(time),
+        "wall_part": np.full_like(time, -1.0),
     }
-    events = find_events(signals, np.array([0, 0, 1.0, 0, 0]), np.array([0, 1, 4, 5, 6.0]), CONFIG, 1.3)
+    events = find_events(
+        signals, np.array([0, 0, 1.0, 0, 0]), np.array([0, 1, 4, 5, 6.0]), CONFIG, 1.3, PARTS
+    )
     assert [item["event"] for item in events] == ["stall", "timeout", "slip"]
     assert events[0]["time_s"] == pytest.approx(2.01)
     assert events[0]["duration_s"] == pytest.approx(0.99, abs=0.02)
     assert events[1]["waypoint"] == "s2"
+
+
+def test_wall_contacts_are_events_with_part_and_largest_force():
+    time = np.arange(0, 10, 0.01)
+    force, part = np.zeros_like(time), np.full_like(time, -1.0)
+    # Rear unit twice with 0.2 s between, one event; the bucket two seconds later, another.
+    for start, end, who, size in ((2.0, 3.0, 1, 4e4), (3.2, 3.5, 1, 9e4), (5.5, 5.6, 2, 1e4)):
+        inside = (time > start - 0.005) & (time < end - 0.005)
+        force[inside], part[inside] = size, who
+    signals = {
+        "time": time,
+        "mode": np.full_like(time, 1.0),
+        "target_wheel_rate": np.zeros_like(time),
+        "v_F": np.ones_like(time),
+        "wheel_slip": np.zeros_like(time),
+        "wall_force": force,
+        "wall_part": part,
+    }
+    events = find_events(signals, np.zeros(5), np.arange(5.0), CONFIG, 1.3, PARTS)
+    assert [item["event"] for item in events] == ["wall contact", "wall contact"]
+    assert [item["part"] for item in events] == ["rear_unit", "bucket"]
+    assert [item["force_N"] for item in events] == [9e4, 1e4]
+    assert [item["time_s"] for item in events] == pytest.approx([2.0, 5.5])
+    assert [item["duration_s"] for item in events] == pytest.approx([1.5, 0.1])
 
 
 @pytest.mark.parametrize(

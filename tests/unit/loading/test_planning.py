@@ -6,7 +6,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drakerock.lhd.kinematics import calc_bucket_range, calc_full_tilt, calc_pitch, calc_tip
+from drakerock.lhd.kinematics import calc_bucket_range, calc_full_tilt, calc_pitch, calc_reach, calc_tip
 from drakerock.loading.config import PlanningConfig, SensingConfig, StrategyConfig
 from drakerock.loading.field import PileProfile
 from drakerock.loading.plan import DigPlan, NoPlan
@@ -67,7 +67,9 @@ def test_plan_sweeps_the_wanted_volume_inside_the_joint_stops(digger, strategy, 
 @given(beta=st.floats(0.05, 1.0), slope=st.floats(0.45, 0.9))
 def test_dig_height_obeys_beta(digger, beta, slope):
     plan = plan_for(digger, make_wedge(slope), beta=beta, kappa=0.0)
-    assert plan.h_s2 == pytest.approx(beta * PLANNING.r_ft * np.sin(plan.slope))
+    assert plan.h_s2 == pytest.approx(
+        beta * calc_reach(digger.kinematics, np.radians(40)) * np.sin(plan.slope)
+    )
     s2 = np.searchsorted(plan.segment, 2) - 1
     kin = digger.kinematics
     if (

@@ -19,7 +19,8 @@ def check_free_flight(trials: Trials) -> list[CheckRow]:
         bench = trials.make(floor=False, gravity=gravity)
         plant, context, instance = bench.plant, bench.plant_context, [bench.machine.instance]
         bodies = [plant.get_body(index) for index in plant.GetBodyIndices(bench.machine.instance)]
-        place(bench, x_tip=0.0, z_tip=0.5 * kin.bucket_length, psi=0.0)
+        # Nose-down by so much that the bucket does not reach its stop on the way.
+        place(bench, x_tip=0.0, z_tip=0.5 * kin.bucket_length, psi=-0.15)
         momentum_0, _, energy_0 = _measure_motion(bench)
         duration = 0.5
         record = trials.run(

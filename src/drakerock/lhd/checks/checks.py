@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from drakerock.errors import InputError
 from drakerock.lhd.checks.balances import check_free_flight, check_records
 from drakerock.lhd.checks.bench import CheckConfig, make_bench
 from drakerock.lhd.checks.forces import (
@@ -19,7 +20,7 @@ from drakerock.lhd.config import MachineConfig
 
 
 def run_machine_checks(config: MachineConfig, checks: CheckConfig | None = None) -> list[CheckRow]:
-    """Measure the machine by simulation (some seconds) and compare with `config.expected`.
+    """Measure the machine by simulation (some seconds) and compare with `config.data`.
 
     Args:
         config: the machine.
@@ -29,13 +30,17 @@ def run_machine_checks(config: MachineConfig, checks: CheckConfig | None = None)
         The table's rows, in the order of the table.
 
     Raises:
-        InputError: the machine's SDFormat file is not usable.
+        InputError: the machine's SDFormat file is not usable, or its payload is not known.
     """
+    if config.data.payload is None:
+        raise InputError(
+            f"machine.expected.payload: not known of {config.model}; what its boom has to lift is checked [kg]"
+        )
     checks = checks or CheckConfig()
     bench = make_bench(config, checks)
     trials = Trials(config, checks, bench.kin, [])
     rows = [
-        *check_geometry(bench, config.expected),
+        *check_geometry(bench, config.data),
         *check_balance(trials),
         *check_traction(trials),
         *check_breakout(trials),

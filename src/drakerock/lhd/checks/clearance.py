@@ -1,16 +1,16 @@
-"""The bucket's distance from the rest of the machine, over its whole range.
+"""Whether boom, bucket and linkage keep clear of each other, of the front unit and of the tyres, everywhere.
 
-Crank, rods and cylinders have no contact shapes, so they are taken by their looks: each mesh falls into its connected
-parts, each part into its convex hull.
+Rods, cranks and cylinders touch only what they are pinned to; so does the bucket. Drake's contact solver never sees
+the machine's own parts meet (they are in one collision filter group): this check does.
 """
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
-import trimesh
-from pydrake.geometry import Convex, GeometryId, Mesh, SceneGraph
-from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import RigidBody
+from pydrake.geometry import GeometryId
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
 
 from drakerock.lhd import names
@@ -22,73 +22,88 @@ from drakerock.lhd.placement import set_machine_angles
 
 # Parts of the linkage that stay further away than this are not worth a line [m].
 _FAR = 0.5
+# Angles of boom and bucket that are looked at, their stops among them.
+_BOOM_ANGLES, _BUCKET_ANGLES = 24, 3
+_OTHERS = ("front_unit", *names.WHEELS[:2])
 
 
 def check_clearance(bench: Bench) -> list[CheckRow]:
-    """Check the bucket's clearance to tyres and front unit, and report that to the linkage's parts.
+    """Check bucket against front unit and tyres, and the linkage's parts against these three.
 
-    The bucket is at its stops, full tilt and full dump, from the lowest to the highest boom.
+    The boom goes from its lowest to its highest angle, the bucket from stop to stop.
     """
     builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01), builder)
+    plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01), builder)
     machine = add_machine(plant, bench.machine.config)
-    bucket = plant.GetCollisionGeometriesForBody(plant.GetBodyByName("bucket", machine.instance))
-    parts = {body.name(): _add_looks(plant, scene_graph, body) for body in _find_linkage(plant, machine)}
-    others = ("front_unit", *names.WHEELS[:2])
-    parts[""] = [
-        g
-        for name in others
-        for g in plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name, machine.instance))
-    ]
     plant.Finalize()
     diagram = builder.Build()
     context = plant.GetMyMutableContextFromRoot(diagram.CreateDefaultContext())
-    nearest = dict.fromkeys(parts, np.inf)
-    for phi_l in bench.kin.phi_l_grid:
-        for phi_b in calc_bucket_range(bench.kin, phi_l):
+    pairs = _find_pairs(plant, machine)
+    nearest = dict.fromkeys(pairs, np.inf)
+    lowest, highest = bench.kin.phi_l_grid[[-1, 0]]
+    for phi_l in np.linspace(lowest, highest, _BOOM_ANGLES):
+        for phi_b in np.linspace(*calc_bucket_range(bench.kin, phi_l), _BUCKET_ANGLES):
             set_machine_angles(plant, context, machine, phi_l=float(phi_l), phi_b=float(phi_b), kin=bench.kin)
             query = plant.get_geometry_query_input_port().Eval(context)
-            for name, shapes in parts.items():
-                distances = [
-                    query.ComputeSignedDistancePairClosestPoints(a, b).distance
-                    for a in bucket
-                    for b in shapes
-                ]
+            for name, shapes in pairs.items():
+                distances = (query.ComputeSignedDistancePairClosestPoints(a, b).distance for a, b in shapes)
                 nearest[name] = min(nearest[name], *distances)
-    rows = [require("clearance of the bucket to tyres and front unit", float(nearest.pop("")), "m", 0.0)]
-    return rows + [
-        CheckRow(f"clearance of the bucket to {name}, by its looks", float(distance), "m")
-        for name, distance in nearest.items()
-        if distance < _FAR
-    ]
-
-
-def _find_linkage(plant: MultibodyPlant, machine: Machine) -> list[RigidBody]:
-    """Return the bodies without a name of `names` that have looks and no pin on the bucket."""
-    loops = [loop for loop in machine.loops if "bucket" in (loop.body_A, loop.body_B)]
-    pinned = {body for loop in loops for body in (loop.body_A, loop.body_B)}
     bodies = [plant.get_body(index) for index in plant.GetBodyIndices(machine.instance)]
-    return [
-        body
-        for body in bodies
-        if body.name() not in {*names.BODIES, *pinned} and plant.GetVisualGeometriesForBody(body)
-    ]
+    bare = sum(not plant.GetCollisionGeometriesForBody(body) for body in bodies)
+    first, *others = nearest.items()
+    rows = [CheckRow("bodies without contact shapes: rocks and walls pass through", bare, "")]
+    rows.append(require(first[0], float(first[1]), "m", 0.0))
+    return rows + [require(name, float(distance), "m", 0.0) for name, distance in others if distance < _FAR]
 
 
-def _add_looks(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> list[GeometryId]:
-    """Give a body contact shapes out of its visual meshes; return them."""
-    inspector = scene_graph.model_inspector()
-    found: list[GeometryId] = []
-    for look in plant.GetVisualGeometriesForBody(body):
-        shape = inspector.GetShape(look)
-        if not isinstance(shape, Mesh) or not shape.source().is_path():
+def _find_pairs(plant: MultibodyPlant, machine: Machine) -> dict[str, list[tuple[GeometryId, GeometryId]]]:
+    """Return the pairs of contact shapes of each line of the table."""
+
+    def shapes(*bodies: str) -> list[GeometryId]:
+        return [
+            geometry
+            for body in bodies
+            for geometry in plant.GetCollisionGeometriesForBody(plant.GetBodyByName(body, machine.instance))
+        ]
+
+    pinned = _find_pinned(plant, machine)
+    lines: dict[str, tuple[str, tuple[str, ...]]] = {
+        "clearance of the bucket to tyres and front unit": ("bucket", _OTHERS)
+    }
+    for index in plant.GetBodyIndices(machine.instance):
+        body = plant.get_body(index).name()
+        if body in names.BODIES:
             continue
-        mesh = trimesh.load(shape.source().path(), force="mesh", process=False)
-        mesh.merge_vertices(merge_norm=True, merge_tex=True)
-        labels = trimesh.graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices))
-        for label in np.unique(labels):
-            name = f"{inspector.GetName(look)}_{len(found)}"
-            hull = Convex(mesh.vertices[labels == label].T * shape.scale3()[:, None], name)
-            X_BG = inspector.GetPoseInFrame(look)
-            found.append(plant.RegisterCollisionGeometry(body, X_BG, hull, name, CoulombFriction(1.0, 1.0)))
-    return found
+        choices: tuple[tuple[str, tuple[str, ...]], ...] = (
+            ("the bucket", ("bucket",)),
+            ("tyres and front unit", _OTHERS),
+        )
+        for title, others in choices:
+            if not pinned[body].intersection(others):
+                lines[f"clearance of {body} to {title}"] = (body, others)
+    pairs = {
+        title: list(itertools.product(shapes(body), shapes(*others)))
+        for title, (body, others) in lines.items()
+    }
+    return {title: found for title, found in pairs.items() if found}
+
+
+def _find_pinned(plant: MultibodyPlant, machine: Machine) -> dict[str, set[str]]:
+    """Return what each body is pinned to by joints and loops; parts of a cylinder together."""
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices(machine.instance)]
+    links = [(j.parent_body().name(), j.child_body().name()) for j in joints]
+    links += [(loop.body_A, loop.body_B) for loop in machine.loops]
+    pinned: dict[str, set[str]] = {
+        plant.get_body(index).name(): set() for index in plant.GetBodyIndices(machine.instance)
+    }
+    for a, b in links:
+        if a in pinned and b in pinned:
+            pinned[a].add(b)
+            pinned[b].add(a)
+    for joint in joints:
+        if joint.type_name() == "prismatic":
+            both = {joint.parent_body().name(), joint.child_body().name()}
+            together = set().union(*(pinned[name] for name in both))
+            for name in both:
+                pinned[name] |= together - both
+    return pinned

@@ -19,7 +19,7 @@ def check_hinge(trials: Trials) -> list[CheckRow]:
     set_angles(bench, *angles)
     p_BQ = np.array([*bench.bucket.profile[0], bench.bucket.outer_width / 2])[[0, 2, 1]]
     R_WB = bench.get_body("bucket").EvalPoseInWorld(bench.plant_context).rotation()
-    weight = 9.81 * trials.config.expected.payload
+    weight = 9.81 * trials.payload
     force = weight * np.array([-0.5, 0.2, 0.7])
     bench.apply_force("bucket", p_BQ, force)
     record = trials.run(bench, 0.3)
@@ -52,7 +52,7 @@ def check_corner(trials: Trials) -> list[CheckRow]:
     record = trials.run(bench, 2.0, wheel=kin.wheel_speed)
     moment = np.linalg.norm(record.moment, axis=1) / 1e3
     late = record.time > record.time[-1] - 1.0
-    expected = scale(trials.config.expected.critical_moment, 1e-3)
+    expected = scale(trials.config.data.critical_moment, 1e-3)
     rule = "for comparison"
     return [
         CheckRow(

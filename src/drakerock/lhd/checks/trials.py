@@ -23,6 +23,13 @@ class Trials:
     kin: Kinematics
     records: list[tuple[Bench, Record]]
 
+    @property
+    def payload(self) -> float:
+        """What the boom has to lift [kg]."""
+        payload = self.config.data.payload
+        assert payload is not None, "checked by run_machine_checks"
+        return payload
+
     def make(self, **options: Any) -> Bench:
         """Build a bench (`make_bench`)."""
         return make_bench(self.config, self.checks, kin=self.kin, **options)
