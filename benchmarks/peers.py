@@ -76,7 +76,9 @@ class Rapier:
             kind = rapier.RigidBodyType.FIXED if pile.fixed[k] else rapier.RigidBodyType.DYNAMIC
             hull = rapier.Collider.convex_hull(SHAPES[pile.shape[k]].vertices * pile.size[k])
             collider = hull.density(ROCKS.density).friction(FRICTION)
-            self._handles.append(world.add_body(rapier.RigidBodyBuilder(kind).position(pose).can_sleep(sleeps), [collider]))
+            self._handles.append(
+                world.add_body(rapier.RigidBodyBuilder(kind).position(pose).can_sleep(sleeps), [collider])
+            )
         ground = world.add_body(rapier.RigidBodyBuilder(rapier.RigidBodyType.FIXED))
         site = make_site(SITE)
         for plane in site.planes:
@@ -125,9 +127,7 @@ class Mujoco:
             spec.add_mesh(name=piece.name, uservert=piece.vertices.ravel())
             spec.worldbody.add_geom(type=mesh, meshname=piece.name, friction=friction)
         for k in range(len(pile)):
-            spec.add_mesh(
-                name=f"rock_{k}", uservert=(SHAPES[pile.shape[k]].vertices * pile.size[k]).ravel()
-            )
+            spec.add_mesh(name=f"rock_{k}", uservert=(SHAPES[pile.shape[k]].vertices * pile.size[k]).ravel())
             body = spec.worldbody.add_body(name=f"rock_{k}", pos=pile.p_WRs[k], quat=pile.q_WRs[k])
             if not pile.fixed[k]:
                 body.add_freejoint()
@@ -210,7 +210,9 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5, help="blocks of each")
     parser.add_argument("--block", type=float, default=2.0, help="CPU time of a block [s]")
     parser.add_argument("--settle", type=float, default=2.0, help="untimed before [s of the pile's time]")
-    parser.add_argument("--settle-cpu", type=float, default=60.0, help="no more than so long for that [CPU s]")
+    parser.add_argument(
+        "--settle-cpu", type=float, default=60.0, help="no more than so long for that [CPU s]"
+    )
     parser.add_argument("--mujoco-solver", choices=["NEWTON", "CG"], default="CG")
     arguments = parser.parse_args()
     Mujoco.solver = arguments.mujoco_solver
