@@ -74,7 +74,8 @@ def _compile[Function: Callable[..., Any]](function: Function, counts_arrays: bo
     for dispatcher in (decorated, inlined):
         _compile_alone(dispatcher)
     _compile_once(inlined)
-    # What kernels that call it ask for.
+    # What kernels that call it ask for; and the other one, for those who want to know.
+    decorated.inlined = inlined  # type: ignore[attr-defined]
     decorated.get_call_template = inlined.get_call_template  # type: ignore[attr-defined]
     decorated.get_overload = inlined.get_overload  # type: ignore[attr-defined]
     return decorated
