@@ -64,7 +64,7 @@ def _compile[Function: Callable[..., Any]](function: Function, counts_arrays: bo
     """Compile a kernel twice, when and where it is called: for Python, and without an entry for Python for kernels.
 
     Most are called by kernels only. The entry takes all fields of all records and tuples apart, and is as long as many
-    a kernel: without it, compilation takes a fifth less.
+    a kernel: without it, compilation takes a sixth less.
     """
     folder = find_cache_folder()
     decorated: Function = _decorate(function, folder, counts_arrays, no_cpython_wrapper=False)
