@@ -12,7 +12,7 @@ conjugate gradients of at most 50 iterations: its default, Newton's method, fact
 (`--mujoco-solver NEWTON`: nine seconds a step of 1 500 rocks).
 
 Each first runs for `--settle` seconds of the pile's own time, untimed, or until that has taken `--settle-cpu`: `awake`
-without sleep in any, `rest` with sleep as each has it (Rapier lets bodies sleep after two seconds at the earliest, so
+without sleep in any, `rest` with sleep as each has it (Rapier lets bodies sleep after half a second of rest, so
 less than that says nothing of it). Reported are CPU time per step, median over blocks, how many rocks are awake, and
 how far rocks have gone since the stored pile: what does not hold the pile still is not the same task.
 """
