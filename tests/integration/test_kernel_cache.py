@@ -38,7 +38,7 @@ print(hashlib.sha256(arrays.positions.tobytes()).hexdigest())
 
 @pytest.mark.slow  # compiles all kernels
 def test_cold_and_warm_cache_give_the_same_bits(tmp_path):
-    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "NUMBA_CACHE_DIR": ""}
     runs = [
         subprocess.run(
             [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True
@@ -99,7 +99,7 @@ def start(tmp_path):
         processes.append(
             subprocess.Popen(
                 [sys.executable, "-c", program], cwd=tmp_path, text=True,
-                env=os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")},
+                env=os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "NUMBA_CACHE_DIR": ""},
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             )
         )  # fmt: skip
