@@ -2,6 +2,10 @@
 
     make bench-compare REV=main
     python benchmarks/compare_revisions.py main --cases help step --repeats 3
+    python benchmarks/compare_revisions.py main --cases idle-100000 make memory --repeats 1
+
+Cases: the commands `load` and `help`, and those of `cases.py`; the three of the last line take minutes each, and are
+measured when asked for. A push has the noise of its force, a worker its memory beside the times.
 
 The other revision is checked out into a temporary folder; both run with the same interpreter, one after the other, in
 alternation, so that a machine whose speed changes does so for both. Each case is run once before it counts (kernels are
@@ -30,52 +34,33 @@ HISTORY = Path(__file__).with_name("history.jsonl")
 PICTURE = ROOT / "out" / "bench" / "history.png"
 
 COMMAND = "import sys; from drakerock.cli import main; sys.argv = ['drakerock', *{arguments!r}]; main()"
-# A program that prints the CPU time of what counts [s]; others count as a whole.
-STEP = """
-import time
-from pydrake.systems.analysis import Simulator
-from drakerock import get_pile, load_scenario, make_station
-from drakerock.lhd.placement import set_machine_pose
-scenario = load_scenario({scenario!r})
-pile = get_pile(scenario)
-station = make_station(scenario, pile)
-simulator = Simulator(station.diagram)
-root = simulator.get_mutable_context()
-station.rocks.set_pile(root, pile)
-context = station.plant.GetMyMutableContextFromRoot(root)
-set_machine_pose(station.plant, context, station.machine, x_tip=-15.0, y=0.0, z_tip=0.03)
-simulator.AdvanceTo(0.05)
-start = time.process_time()
-simulator.AdvanceTo(1.05)
-print(time.process_time() - start)
-"""
-REFILL = """
-import time
-import numpy as np
-from drakerock import get_pile, load_scenario
-from drakerock.loading.scenario import make_recipe
-from drakerock.rocks.making.refill import refill
-from drakerock.rocks.shapes import load_rock_shapes
-scenario = load_scenario({scenario!r})
-pile = get_pile(scenario)
-removed = np.zeros(len(pile), bool)
-removed[np.argsort(np.linalg.norm(pile.p_WRs - [-3.0, 0.0, 0.5], axis=1) + 100.0 * pile.fixed)[:120]] = True
-shapes = load_rock_shapes(scenario.rocks.shapes)
-start = time.process_time()
-refill(pile, removed, shapes, make_recipe(scenario), np.random.default_rng(0))
-print(time.process_time() - start)
-"""
-CASES = {
-    "load": COMMAND.format(arguments=["load", "{scenario}", "--no-replay", "--out", "{out}"]),
-    "step": STEP,
-    "help": COMMAND.format(arguments=["--help"]),
-    "refill": REFILL,
+COMMANDS = {"load": ["load", "{scenario}", "--no-replay", "--out", "{out}"], "help": ["--help"]}
+# The others are this tree's `cases.py`, with the modules of either revision.
+CASES: dict[str, list[str]] = {
+    "step": ["step"],
+    "idle": ["idle"],
+    "idle-100000": ["idle", "--rocks", "100000"],
+    "push": ["push"],
+    "refill": ["refill"],
+    "make": ["make"],
+    "memory": ["memory"],
 }
+DEFAULT = ["load", "help", "step", "idle", "push", "refill"]
 MEANING = {
-    "load": "drakerock load of the demo's cycle",
-    "step": "a second of the station's Diagram, machine standing off the pile",
-    "help": "drakerock --help",
-    "refill": "a refill after 120 rocks",
+    "load": "drakerock load of the demo's cycle [CPU s]",
+    "help": "drakerock --help [CPU s]",
+    "step": "a second of the station's Diagram, machine standing off the pile [CPU s]",
+    "idle_5770": "a step of it, none of 5 770 rocks awake [CPU s]",
+    "idle_100000": "a step of it, none of 100 000 rocks awake [CPU s]",
+    "push_median": "a blade's push at imposed speed, median step [CPU s]",
+    "push_slowest": "a blade's push at imposed speed, slowest step [CPU s]",
+    "push_mean_kN": "its mean force [kN]",
+    "push_noise_kN": "the noise of its force [kN]",
+    "refill": "a refill after 120 rocks [CPU s]",
+    "make": "the shipped pile from nothing [CPU s]",
+    "memory_MB": "a worker's memory after six loadings [MB]",
+    "memory_growth_MB": "its growth per loading [MB]",
+    "loading": "a loading in it, with refill [CPU s]",
 }
 
 
@@ -93,15 +78,19 @@ def check_out(revision: str) -> Iterator[Path]:
             subprocess.run(["git", "worktree", "remove", "--force", tree], cwd=ROOT, check=True)
 
 
-def measure(tree: Path, case: str) -> float:
-    """Run a case once in a process of its own; return its CPU time [s].
+def measure(tree: Path, case: str) -> dict[str, float]:
+    """Run a case once in a process of its own; return its quantities, of a command its CPU time [s].
 
     Raises:
         RuntimeError: it failed.
     """
+    scenario = str(tree / "studies" / "demo.yaml")
     with tempfile.TemporaryDirectory(prefix="drakerock-bench-") as out:
-        program = CASES[case].replace("{scenario!r}", repr(str(tree / "studies" / "demo.yaml")))
-        program = program.replace("{scenario}", str(tree / "studies" / "demo.yaml")).replace("{out}", out)
+        if case in COMMANDS:
+            words = [word.format(scenario=scenario, out=out) for word in COMMANDS[case]]
+            program = ["-c", COMMAND.format(arguments=words)]
+        else:
+            program = [str(Path(__file__).with_name("cases.py")), *CASES[case], "--scenario", scenario]
         environment = os.environ | {
             "OMP_NUM_THREADS": "1",
             "NUMBA_NUM_THREADS": "1",
@@ -109,36 +98,35 @@ def measure(tree: Path, case: str) -> float:
         }
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         run = subprocess.run(
-            [sys.executable, "-c", program],
-            env=environment,
-            cwd=out,
-            capture_output=True,
-            text=True,
-            check=False,
+            [sys.executable, *program], env=environment, cwd=out, capture_output=True, text=True, check=False
         )
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if run.returncode:
         raise RuntimeError(f"{case} failed in {tree}: {run.stderr.strip().splitlines()[-1:]}")
-    if case in ("step", "refill"):
-        return float(run.stdout.split()[-1])
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    if case in COMMANDS:
+        return {case: after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime}
+    return dict(json.loads(run.stdout.splitlines()[-1]))
 
 
-def compare(other: Path, case: str, repeats: int) -> dict[str, Any]:
-    """Return the median ratio of CPU times, present over other, all ratios, and both medians [s]."""
+def compare(other: Path, case: str, repeats: int) -> dict[str, dict[str, Any]]:
+    """Return, of each quantity, the median ratio of present over other, all ratios, and both medians."""
     trees = (ROOT, other)
     for tree in trees:
         measure(tree, case)
-    times: dict[Path, list[float]] = {tree: [] for tree in trees}
+    values: dict[Path, list[dict[str, float]]] = {tree: [] for tree in trees}
     for k in range(repeats):
         for tree in trees if k % 2 == 0 else reversed(trees):
-            times[tree].append(measure(tree, case))
-    ratios = [present / before for present, before in zip(times[ROOT], times[other], strict=True)]
-    return {
-        "ratio": round(statistics.median(ratios), 4),
-        "ratios": [round(ratio, 4) for ratio in ratios],
-        "cpu_s": [round(statistics.median(times[tree]), 3) for tree in trees],
-    }
+            values[tree].append(measure(tree, case))
+    results = {}
+    for name in values[ROOT][0]:
+        present, before = ([item[name] for item in values[tree]] for tree in trees)
+        ratios = [one / two if two else float("nan") for one, two in zip(present, before, strict=True)]
+        results[name] = {
+            "ratio": round(statistics.median(ratios), 4),
+            "ratios": [round(ratio, 4) for ratio in ratios],
+            "medians": [round(statistics.median(part), 6) for part in (present, before)],
+        }
+    return results
 
 
 def describe_revision(revision: str) -> str:
@@ -173,14 +161,14 @@ def draw(path: Path) -> None:
 
     lines = [json.loads(line) for line in HISTORY.read_text(encoding="utf-8").splitlines()]
     figure, axes = plt.subplots(figsize=(9, 4), layout="constrained")
-    for case in CASES:
+    for case in MEANING:
         points = [(k, line["cases"][case]["ratio"]) for k, line in enumerate(lines) if case in line["cases"]]
         if points:
             axes.plot(*zip(*points, strict=True), "o-", label=MEANING[case])
     axes.axhline(1.0, color="0.6", linewidth=1)
     axes.set_xticks(range(len(lines)), [f"{line['revision']}\nagainst {line['against']}" for line in lines])
     axes.tick_params(axis="x", rotation=45)
-    axes.set_ylabel("CPU time, ratio")
+    axes.set_ylabel("ratio")
     axes.legend()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
@@ -190,7 +178,7 @@ def main() -> None:
     """Compare, say, keep and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("revision", help="what to compare the present tree with")
-    parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
+    parser.add_argument("--cases", nargs="+", choices=[*COMMANDS, *CASES], default=DEFAULT)
     parser.add_argument("--repeats", type=int, default=5, help="pairs of runs of each case")
     arguments = parser.parse_args()
     against = describe_revision(arguments.revision)
@@ -205,16 +193,17 @@ def main() -> None:
     with check_out(against) as other:
         for case in arguments.cases:
             try:
-                result = compare(other, case, arguments.repeats)
+                results = compare(other, case, arguments.repeats)
             except RuntimeError as error:  # an older revision may lack what a case uses
                 print(error)
                 continue
-            line["cases"][case] = result
-            present, before = result["cpu_s"]
-            print(
-                f"{MEANING[case]}: {result['ratio']:.3f} ({present:.2f} s, {before:.2f} s at {against})",
-                flush=True,
-            )
+            line["cases"] |= results
+            for name, result in results.items():
+                present, before = result["medians"]
+                print(
+                    f"{MEANING[name]}: {result['ratio']:.3f} ({present:.4g}, {before:.4g} at {against})",
+                    flush=True,
+                )
     with open(HISTORY, "a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
     draw(PICTURE)

@@ -8,6 +8,7 @@ import shutil
 import tempfile
 
 import numpy as np
+import platformdirs
 import pytest
 from hypothesis import settings
 from pydrake.systems.framework import DiagramBuilder
@@ -24,8 +25,10 @@ from drakerock.rocks.engine.config import DynamicsConfig
 from drakerock.rocks.shapes import RockShape, load_rock_shapes
 from drakerock.rocks.state import PileState
 
-# Piles and kernels made by tests never come from, nor go to, the user's cache; pytest-xdist's workers share one.
+# Piles made by tests never come from, nor go to, the user's cache; pytest-xdist's workers share one. Kernels are kept
+# by a hash of their sources: they can come from there, and what uses the same checkout after the tests has them.
 if "PYTEST_XDIST_WORKER" not in os.environ:
+    os.environ.setdefault("NUMBA_CACHE_DIR", platformdirs.user_cache_dir("drakerock"))
     os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="drakerock-cache-")
     atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
 

@@ -28,6 +28,11 @@ def result(small_scenario, pile):
     return run_cycle(small_scenario, pile)
 
 
+@pytest.fixture(scope="module")
+def nonsmooth_result(small_scenario, pile):
+    return run_cycle(use_engine(small_scenario, "nonsmooth"), pile)
+
+
 def use_engine(scenario, engine):
     """Return the scenario with that rock engine."""
     return scenario.replace(**{"dynamics.rocks": engine})
@@ -55,12 +60,12 @@ def test_bucket_forces_lift_the_load(result):
     assert force == pytest.approx(result.outcome.bucket_mass_kg, abs=150)
 
 
-def test_load_is_counted_when_s4_is_passed(small_scenario, pile, result):
+def test_load_is_counted_when_s4_is_passed(small_scenario, pile, nonsmooth_result):
     """The simulation stops in the step in which the controller passes s4, not at the next frame."""
-    config = small_scenario.replace(**{"recording.frame_rate": 2.0})
+    config = use_engine(small_scenario, "nonsmooth").replace(**{"recording.frame_rate": 2.0})
     coarse = run_cycle(config, pile).outcome
-    assert coarse.bucket_mass_kg == result.outcome.bucket_mass_kg
-    assert coarse.waypoint_times_s == result.outcome.waypoint_times_s
+    assert coarse.bucket_mass_kg == nonsmooth_result.outcome.bucket_mass_kg
+    assert coarse.waypoint_times_s == nonsmooth_result.outcome.waypoint_times_s
 
 
 # When the bucket is in the pile [s].
@@ -165,14 +170,13 @@ def test_scanner_sees_enough_to_dig(small_scenario, pile):
     assert outcome.bucket_mass_kg > 0
 
 
-def test_stored_plan_is_driven_again(small_scenario, pile, result, tmp_path):
+def test_stored_plan_is_driven_again(small_scenario, pile, result, nonsmooth_result, tmp_path):
     save_plan(result.plan, result.field, tmp_path / "plan.json")
     source = {"planning": {"source": str(tmp_path / "plan.json")}, "strategy": {"alpha": 1.9}}
     again = run_cycle(with_loading(small_scenario, **source), pile)
     assert again.plan.to_dict() == result.plan.to_dict()
-    fresh = run_cycle(with_loading(small_scenario), pile)
-    assert again.outcome.phi1 == fresh.outcome.phi1
-    assert again.outcome.waypoint_times_s == fresh.outcome.waypoint_times_s
+    assert again.outcome.phi1 == nonsmooth_result.outcome.phi1
+    assert again.outcome.waypoint_times_s == nonsmooth_result.outcome.waypoint_times_s
 
 
 def test_solver_failure_is_a_recorded_outcome(small_scenario, pile):
@@ -183,7 +187,7 @@ def test_solver_failure_is_a_recorded_outcome(small_scenario, pile):
         if time > 1.0:
             raise RuntimeError("the solver failed to converge")
 
-    result = run_cycle(small_scenario, pile, fail_at_one_second)
+    result = run_cycle(use_engine(small_scenario, "nonsmooth"), pile, fail_at_one_second)
     assert result.outcome.status == "failed"
     assert "solver failed to converge" in result.outcome.reason
     assert result.outcome.phi1 is None

@@ -9,7 +9,6 @@ import re
 import shlex
 import shutil
 import sqlite3
-import sys
 from pathlib import Path
 
 import jsonschema
@@ -61,18 +60,8 @@ def store(finished, tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
-    """Return a function that runs the command with its words, and returns exit code, output and errors."""
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["drakerock", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        out, err = capsys.readouterr()
-        assert "Traceback" not in out + err, err
-        return ended.value.code or 0, out, err
-
-    return run
+def run(run_command):
+    return run_command
 
 
 def test_status_in_words_and_as_json(store, run):

@@ -61,25 +61,43 @@ def allocating_kernel[Function: Callable[..., Any]](function: Function) -> Funct
 
 
 def _compile[Function: Callable[..., Any]](function: Function, counts_arrays: bool) -> Function:
+    """Compile a kernel twice, when and where it is called: for Python, and without an entry for Python for kernels.
+
+    Most are called by kernels only. The entry takes all fields of all records and tuples apart, and is as long as many
+    a kernel: without it, compilation takes a sixth less.
+    """
+    folder = find_cache_folder()
+    decorated: Function = _decorate(function, folder, counts_arrays, no_cpython_wrapper=False)
+    if numba.config.DISABLE_JIT:
+        return decorated
+    inlined = _decorate(function, folder / "inlined", counts_arrays, no_cpython_wrapper=True)
+    for dispatcher in (decorated, inlined):
+        _compile_alone(dispatcher)
+    _compile_once(inlined)
+    # What kernels that call it ask for; and the other one, for those who want to know.
+    decorated.inlined = inlined  # type: ignore[attr-defined]
+    decorated.get_call_template = inlined.get_call_template  # type: ignore[attr-defined]
+    decorated.get_overload = inlined.get_overload  # type: ignore[attr-defined]
+    return decorated
+
+
+def _decorate(function: Callable[..., Any], folder: Path, counts_arrays: bool, **options: bool) -> Any:
     # Strict arithmetic: with fused or reordered operations the results depend on what the compiler inlines, and
     # that differs between kernels just compiled and kernels from the cache. It costs a tenth of the time.
     # numba reads its cache folder when it decorates; other users of numba must not see ours.
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(find_cache_folder())
+    numba.config.CACHE_DIR = str(folder)
     try:
-        decorated: Function = numba.njit(
+        return numba.njit(
             cache=True,
             error_model="numpy",
             _nrt=counts_arrays,
             forceinline=not counts_arrays,
             no_cfunc_wrapper=True,  # nothing in C calls them
+            **options,
         )(function)
     finally:
         numba.config.CACHE_DIR = before
-    if not numba.config.DISABLE_JIT:
-        _compile_alone(decorated)
-        _compile_once(decorated)
-    return decorated
 
 
 class _OneProcess:
