@@ -78,6 +78,15 @@ class PlanningConfig(Config):
     n_segment: Annotated[int, Field(ge=10, le=2000, description="path points a segment")] = 60
 
 
+class WeightTransferConfig(Config):
+    """Raising the boom during the push: the pile's weight on the bucket loads the front wheels."""
+
+    height: Annotated[
+        float, Field(ge=0, le=1, description="how far the tip is raised on [s0, s1]; 0: not at all [m]")
+    ] = 0.0
+    rate: Annotated[float, Field(gt=0, le=1, description="the boom's rate meanwhile [rad/s]")] = 0.02
+
+
 class ControlConfig(Config):
     """The feed-forward controller."""
 
@@ -86,6 +95,7 @@ class ControlConfig(Config):
     ] = 0.1
     timeout: Annotated[float, Field(gt=0, description="allowed beyond a segment's planned time [s]")] = 5.0
     approach_time: Annotated[float, Field(gt=0, description="allowed from the start to s0 [s]")] = 20.0
+    weight_transfer: WeightTransferConfig = WeightTransferConfig()
 
 
 class PerformanceConfig(Config):

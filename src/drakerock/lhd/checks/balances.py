@@ -75,9 +75,14 @@ def _calc_work(bench: Bench, record: Record) -> tuple[float, float]:
         if joint.num_velocities() != 1:
             continue
         rate = bench.get_rate(record, joint.name())
-        torque = -joint.default_damping_vector()[0] * rate
+        damping = joint.default_damping_vector()[0]
+        torque = np.zeros_like(rate)
         if joint.name() in names.JOINTS:
-            torque = torque + record.effort[:, bench.get_column(joint.name())]
+            torque = record.effort[:, bench.get_column(joint.name())]
+        if joint.name() in names.WHEEL_JOINTS:
+            # That part is the motor's.
+            damping -= bench.machine.wheel.drag
+        torque = torque - damping * rate
         power = torque * (rate + np.concatenate([[0.0], rate[:-1]])) / 2
         work += float(power.sum() * plant.time_step())
         turnover += float(np.abs(power).sum() * plant.time_step())
@@ -107,7 +112,7 @@ def check_records(trials: Trials) -> list[CheckRow]:
             for joint in joints
         )
         limits = trials.records[0][0].machine
-        limit = {"wheels": limits.wheel, "boom": limits.boom, "bucket": limits.bucket}[name].effort
+        limit = {"wheels": limits.wheel, "boom": limits.boom, "bucket": limits.bucket}[name].peak
         rows.append(bound(f"torque of {name}, all runs", torque / 1e3, "kNm", limit / 1e3 * (1 + 1e-9)))
     walls = [float(record.wall[-1]) for _, record in trials.records]
     return [*rows, CheckRow("wall time of a step, the machine alone", 1e3 * float(np.median(walls)), "ms")]
