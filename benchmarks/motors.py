@@ -11,15 +11,9 @@ can be stopped at any time and goes on from there. `table` reads what is there, 
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
 
-import numpy as np
-from scipy import stats
-
 from drakerock import load_scenario
-from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario
 from drakerock.loading.sequence import run_sequence
 

@@ -82,7 +82,11 @@ def _warn_of(lines: tuple[str, ...]) -> None:
 
 
 def _apply_motor(
-    plant: MultibodyPlant, instance: ModelInstanceIndex, name: str, config: MotorConfig, machine: MachineConfig
+    plant: MultibodyPlant,
+    instance: ModelInstanceIndex,
+    name: str,
+    config: MotorConfig,
+    machine: MachineConfig,
 ) -> Motor:
     actuator = plant.GetJointActuatorByName(name, instance)
     joint = plant.GetJointByName(name, instance)

@@ -103,6 +103,10 @@ class PerformanceConfig(Config):
 
     tau_c: Annotated[float, Field(gt=0, description="critical hinge moment [N m]")] = 145e3
     t_char: Annotated[float, Field(gt=0, description="characteristic time of the damage integral [s]")] = 12.0
+    loose_packing: Annotated[
+        float,
+        Field(gt=0, le=1, description="share of solid rock in the load's loose volume, for the fill factor"),
+    ] = 0.58
     settle_time: Annotated[
         float, Field(ge=0, le=60, description="at most this long after s4 for the rocks to rest [s]")
     ] = 6.0

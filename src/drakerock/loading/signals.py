@@ -69,7 +69,9 @@ def calc_signals(station: Station, root_context: Context) -> tuple[dict[str, Arr
         following = np.concatenate([rate[:, 1:], rate[:, -1:]], axis=1)
         torque = np.array(
             [
-                calc_motor_torques(station.machine, joint, *(data[key][row_of_torque[joint]] for key in TORQUE_PARTS), after)
+                calc_motor_torques(
+                    station.machine, joint, *(data[key][row_of_torque[joint]] for key in TORQUE_PARTS), after
+                )
                 for joint, after in zip(members, following, strict=True)
             ]
         )

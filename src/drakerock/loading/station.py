@@ -183,9 +183,12 @@ def make_station(
     )
     controller_system = builder.AddSystem(
         make_part(
-            "controller", controller, parts.controller, view,
+            "controller",
+            controller,
+            parts.controller,
+            view,
             lambda: FeedforwardController(digger.kinematics, loading.control.weight_transfer),
-        )  # fmt: skip
+        )
     )
     tracker = controller_system
     if not controller_system.HasOutputPort("progress"):
@@ -247,8 +250,8 @@ def make_station(
 
 
 LOGGED = (
-    "measurement", "motor_speeds", "mode", "net_actuation", "motor_bias", "machine_state", "hinge_moment", "bucket_force",
-    "rock_summary",
+    "measurement", "motor_speeds", "mode", "net_actuation", "motor_bias", "machine_state", "hinge_moment",
+    "bucket_force", "rock_summary",
 )  # fmt: skip
 """Signals that are logged in every step."""
 EXPORTED = ("measurement", "plan", "height_field", "mode", "progress", "motor_speeds", "pile", "bucket_force")

@@ -14,6 +14,7 @@ import pyarrow.parquet
 from drakerock.errors import InputError
 from drakerock.exploration.problem import Array
 from drakerock.exploration.table import ResponseTable, average_loadings
+from drakerock.loading.mining import MINING
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.study.db import STUDY, Store
 from drakerock.study.objectives import get_objective
@@ -102,6 +103,9 @@ def read_loadings(store: Store) -> pa.Table:
                  "peak_push_force_N", "mean_push_force_N", "sim_time_s", "steps", "seed",
                  "scenario_hash", "wall_time_s"):  # fmt: skip
         columns[name] = [outcome[name] for outcome in outcomes]
+    for name in MINING:
+        values = [(outcome.get("mining") or {}).get(name) for outcome in outcomes]
+        columns[name] = pa.array(values, pa.float64())
     for name in ("total", "awake_mean", "awake_max"):
         columns[f"rocks_{name}"] = [outcome["rocks"].get(name) for outcome in outcomes]
     columns["seconds"] = [row[6] for row in rows]

@@ -109,7 +109,10 @@ class Bench:
         self.motors.GetInputPort("motor_speeds").FixValue(
             self.motors.GetMyMutableContextFromRoot(root), np.array([wheel, boom, bucket])
         )
-        motors_context, hinge_context = self.motors.GetMyContextFromRoot(root), self.hinge.GetMyContextFromRoot(root)
+        motors_context, hinge_context = (
+            self.motors.GetMyContextFromRoot(root),
+            self.hinge.GetMyContextFromRoot(root),
+        )
         steps = round(duration / plant.time_step())
         start = round(root.get_time() / plant.time_step())
         columns: dict[str, list[object]] = {key: [] for key in Record.__dataclass_fields__}

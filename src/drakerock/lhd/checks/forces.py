@@ -73,12 +73,8 @@ def check_traction(trials: Trials) -> list[CheckRow]:
     slipping = min(kin.wheel_speed, motor.find_rate(friction * normal * kin.wheel_radius / 4))
     return [
         compare("traction against a wall", push / 1e3, "kN", friction * normal / 1e3, 0.02),
-        CheckRow(
-            "traction the motors could hold", 4 * motor.effort / kin.wheel_radius / 1e3, "kN"
-        ),
-        require(
-            "wheels slip before they stall: slowest wheel", float(min(rates)), "rad/s", 0.9 * slipping
-        ),
+        CheckRow("traction the motors could hold", 4 * motor.effort / kin.wheel_radius / 1e3, "kN"),
+        require("wheels slip before they stall: slowest wheel", float(min(rates)), "rad/s", 0.9 * slipping),
         bound(
             "wheels slip before they stall: largest torque",
             float(max(efforts)) / 1e3,
