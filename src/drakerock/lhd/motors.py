@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
+from pydrake.common.value import Value
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, DiscreteValues, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiagramBuilder,
+    DiscreteValues,
+    LeafSystem,
+    ValueProducer,
+)
 
 from drakerock.errors import InputError
 from drakerock.lhd import names
 from drakerock.lhd.model import Machine
 from drakerock.lhd.motor_law import MotorCommand
+from drakerock.memory import weak
 
 Array = np.ndarray
 
@@ -60,7 +69,13 @@ class Motors(LeafSystem):
         state = self.DeclareDiscreteState(np.zeros(len(self._functions)))
         self.DeclarePeriodicDiscreteUpdateEvent(plant.time_step(), 0.0, self._update)
         # Not of the net actuation, which follows from these; nor of time, so that a step is solved once.
-        sources = {self._speeds.ticket(), self._machine_state.ticket(), self.discrete_state_ticket(state)}
+        commands = self.DeclareCacheEntry(
+            "commands",
+            ValueProducer(allocate=lambda: Value[object]([]), calc=weak(self._calc_commands)),
+            {self._speeds.ticket(), self._machine_state.ticket(), self.discrete_state_ticket(state)},
+        )
+        self._commands = commands.cache_index()
+        sources = {commands.ticket()}
         self.DeclareVectorOutputPort("desired_state", 2 * n, self._calc_desired_state, sources)
         self.DeclareVectorOutputPort("actuation", n, self._calc_actuation, sources)
         self.DeclareVectorOutputPort(
@@ -68,34 +83,40 @@ class Motors(LeafSystem):
         )
         self.DeclareVectorOutputPort("bias", n, self._calc_bias, sources)
 
-    def _calc_commands(self, context: Context) -> list[MotorCommand]:
+    def _calc_commands(self, context: Context, value: Value) -> None:
         speeds, state = self._speeds.Eval(context), self._machine_state.Eval(context)
         torques = dict(zip(self._functions, context.get_discrete_state_vector().value(), strict=True))
-        return [
-            MotorCommand(0.0, 0.0, 0.0)
-            if motor is None
-            else motor.calc_command(
-                float(speeds[self._sources[k]]), float(state[self._rates[k]]), float(torques.get(k, 0.0))
-            )
-            for k, motor in enumerate(self._motors)
-        ]
+        value.set_value(
+            [
+                MotorCommand(0.0, 0.0, 0.0)
+                if motor is None
+                else motor.calc_command(
+                    float(speeds[self._sources[k]]), float(state[self._rates[k]]), float(torques.get(k, 0.0))
+                )
+                for k, motor in enumerate(self._motors)
+            ]
+        )
+
+    def _get_commands(self, context: Context) -> list[MotorCommand]:
+        commands: list[MotorCommand] = self.get_cache_entry(self._commands).Eval(context)
+        return commands
 
     def _calc_desired_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._positions + [command.rate for command in self._calc_commands(context)])
+        output.SetFromVector(self._positions + [command.rate for command in self._get_commands(context)])
 
     def _calc_actuation(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([command.feedforward for command in self._calc_commands(context)])
+        output.SetFromVector([command.feedforward for command in self._get_commands(context)])
 
     def _calc_generalized_force(self, context: Context, output: BasicVector) -> None:
         force = np.zeros(output.size())
-        force[self._starts] = [command.bias for command in self._calc_commands(context)]
+        force[self._starts] = [command.bias for command in self._get_commands(context)]
         output.SetFromVector(force)
 
     def _calc_bias(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([command.bias for command in self._calc_commands(context)])
+        output.SetFromVector([command.bias for command in self._get_commands(context)])
 
     def _update(self, context: Context, values: DiscreteValues) -> None:
-        net, commands = self._net_actuation.Eval(context), self._calc_commands(context)
+        net, commands = self._net_actuation.Eval(context), self._get_commands(context)
         values.set_value([net[k] + commands[k].bias for k in self._functions])
 
 
