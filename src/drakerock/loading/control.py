@@ -118,5 +118,7 @@ class FeedforwardController(LeafSystem):
             return
         measured = self._measurement.Eval(context)
         mode = Mode(int(self._mode.Eval(context)[0]))
-        tip = (float(measured[k]) for k in self._indices)
-        output.SetFromVector(calc_motor_speeds(plan, mode, self._kinematics, *tip, self._weight_transfer))
+        x, z, psi = (float(measured[k]) for k in self._indices)
+        output.SetFromVector(
+            calc_motor_speeds(plan, mode, self._kinematics, x, z, psi, self._weight_transfer)
+        )

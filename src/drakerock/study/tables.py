@@ -104,8 +104,9 @@ def read_loadings(store: Store) -> pa.Table:
                  "scenario_hash", "wall_time_s"):  # fmt: skip
         columns[name] = [outcome[name] for outcome in outcomes]
     for name in MINING:
-        values = [(outcome.get("mining") or {}).get(name) for outcome in outcomes]
-        columns[name] = pa.array(values, pa.float64())
+        columns[name] = pa.array(
+            [(outcome.get("mining") or {}).get(name) for outcome in outcomes], pa.float64()
+        )
     for name in ("total", "awake_mean", "awake_max"):
         columns[f"rocks_{name}"] = [outcome["rocks"].get(name) for outcome in outcomes]
     columns["seconds"] = [row[6] for row in rows]

@@ -39,13 +39,13 @@ def get_torque(bench: Bench, record, joint: str = "boom_joint") -> np.ndarray:
 
 
 def test_boom_at_zero_command_holds_its_load():
-    """Below a millimetre, at once and to stay: a tenth of it after the first second is no drift."""
+    """Below a millimetre at once, and no drift (`test_motor_law` has the ten seconds)."""
     bench = hang()
     start = bench.plant.GetFrameByName("tip").CalcPoseInWorld(bench.plant_context).translation().copy()
-    record = bench.run(3.0)
+    record = bench.run(1.5)
     sag = np.linalg.norm(record.tip - start, axis=1)
     assert sag.max() < 1e-3
-    assert np.ptp(sag[100:]) < 1e-6
+    assert np.ptp(sag[75:]) < 1e-6
     assert np.abs(get_torque(bench, record)[-1]) > 5e5
 
 
@@ -79,28 +79,39 @@ def test_wheels_stall_with_the_stall_torque_and_run_along_the_curve():
     assert torque[-1] == pytest.approx(0.0, abs=300.0)
 
 
+def calc_obstacle_load(bench: Bench, x: float) -> tuple[float, float]:
+    """Return what the obstacle presses on the bucket with, downwards [N], and its moment about the floor at x [N m]."""
+    results = bench.plant.get_contact_results_output_port().Eval(bench.plant_context)
+    bucket = bench.get_body("bucket").index()
+    down, moment = 0.0, 0.0
+    for k in range(results.num_point_pair_contacts()):
+        contact = results.point_pair_contact_info(k)
+        if bucket not in (contact.bodyA_index(), contact.bodyB_index()):
+            continue
+        sign = 1.0 if contact.bodyB_index() == bucket else -1.0
+        force, point = sign * contact.contact_force(), contact.contact_point()
+        down -= force[2]
+        moment += -force[2] * (point[0] - x) + force[0] * point[2]
+    return down, moment
+
+
 def test_raising_the_boom_loads_the_front_wheels():
-    """Pushing a wall under an overhang, the boom raised at the rate of a weight transfer: by the lever rule."""
-    reach = 0.3
-    bench = make(obstacle=Obstacle(Box(2.0, 4.0, 0.5), (1.0 - reach, 0.0, 0.25 + 0.24), 0.0))
+    """Under an overhang, the boom raised as for a weight transfer: by the lever rule, and the valve keeps it."""
+    bench = make("{boom: {effort: 6.0e+5}}", obstacle=Obstacle(Box(2.0, 1.0, 0.5), (0.9, 0.0, 0.55), 0.0))
     set_machine_pose(bench.plant, bench.plant_context, bench.machine, kin=bench.kin, x_tip=0.0, z_tip=0.2)
-    before = bench.run(0.3).tyre_force[-1, :, 2]
-    bench.run(0.8, boom=-0.02)
-    record = bench.run(0.5)
-    after, down = record.tyre_force[-1, :, 2], -record.bucket_force[-1, 2]
-    context = bench.plant_context
+    before = bench.run(0.3).tyre_force[-1, :2, 2].sum()
+    bench.run(1.1, boom=-0.02)
+    record = bench.run(0.4)
     front, rear = (
-        bench.get_body(name).EvalPoseInWorld(context).translation()[0]
+        bench.get_body(name).EvalPoseInWorld(bench.plant_context).translation()[0]
         for name in ("wheel_front_left", "wheel_rear_left")
     )
-    # The overhang's front edge presses on the lip or, behind it, on the floor plate.
-    share = (after[:2].sum() - before[:2].sum()) / down
+    down, moment = calc_obstacle_load(bench, rear)
+    expected = moment / (front - rear)
     assert down > 5e4
-    assert after.sum() - before.sum() == pytest.approx(down, rel=0.02)
-    lowest, highest = ((x - rear) / (front - rear) for x in (-reach - 0.1, 0.1))
-    assert lowest < share < highest
-    # The closed valve keeps it.
-    assert np.ptp(record.tyre_force[20:, :2, 2].sum(axis=1)) < 0.02 * down
+    assert expected > down
+    assert record.tyre_force[-1, :2, 2].sum() - before == pytest.approx(expected, rel=0.02)
+    assert np.ptp(record.tyre_force[20:, :2, 2].sum(axis=1)) < 0.02 * expected
 
 
 def test_repeats_from_a_saved_context_bit_for_bit():
