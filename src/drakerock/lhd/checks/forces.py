@@ -69,8 +69,9 @@ def check_traction(trials: Trials) -> list[CheckRow]:
     rates = [bench.get_rate(record, joint)[late].mean() for joint in names.WHEEL_JOINTS]
     efforts = [np.abs(record.effort[late, bench.get_column(j)]).max() for j in names.WHEEL_JOINTS]
     motor = bench.machine.wheel
-    # Where the torque curve meets what slipping tyres take.
-    slipping = min(kin.wheel_speed, motor.find_rate(friction * normal * kin.wheel_radius / 4))
+    # Where the torque curve meets what slipping tyres take; one that does not would stall.
+    slip_rate = motor.find_rate(friction * normal * kin.wheel_radius / 4)
+    slipping = min(kin.wheel_speed, slip_rate or kin.wheel_speed)
     return [
         compare("traction against a wall", push / 1e3, "kN", friction * normal / 1e3, 0.02),
         CheckRow("traction the motors could hold", 4 * motor.effort / kin.wheel_radius / 1e3, "kN"),
