@@ -130,6 +130,8 @@ def make_table(rows: list[dict[str, object]]) -> str:
                 row for row in rows
                 if row["choice"] == choice and tuple(row["strategy"]) == strategy and row["status"] == "done"
             ]  # fmt: skip
+            if not chosen:
+                continue
             cells = [str(list(strategy)), choice, str(len(chosen))]
             for name, (_, factor, form) in COLUMNS.items():
                 values = [factor * float(row[name]) for row in chosen if row[name] is not None]
