@@ -69,8 +69,9 @@ def check_traction(trials: Trials) -> list[CheckRow]:
     rates = [bench.get_rate(record, joint)[late].mean() for joint in names.WHEEL_JOINTS]
     efforts = [np.abs(record.effort[late, bench.get_column(j)]).max() for j in names.WHEEL_JOINTS]
     motor = bench.machine.wheel
-    # Where the torque curve meets what slipping tyres take; one that does not would stall.
-    slip_rate = motor.find_rate(friction * normal * kin.wheel_radius / 4)
+    # Where the torque curve meets what the most loaded slipping tyre takes; a motor without that would stall.
+    heaviest = record.tyre_force[late, :, 2].mean(axis=0).max()
+    slip_rate = motor.find_rate(friction * heaviest * kin.wheel_radius)
     slipping = min(kin.wheel_speed, slip_rate or kin.wheel_speed)
     return [
         compare("traction against a wall", push / 1e3, "kN", friction * normal / 1e3, 0.02),
