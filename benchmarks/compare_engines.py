@@ -39,10 +39,11 @@ import numpy as np
 from faithfulness import SIZES, compare, make_small_pile
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from rocks import ROCKS, SHAPES, TIME_STEP, Motors, calc_bucket_mass, clear_way, make_dig
+from rocks import ROCKS, SHAPES, TIME_STEP, HeldRates, calc_bucket_mass, clear_way, make_dig
 
 from drakerock.lhd.config import MachineConfig
-from drakerock.lhd.model import add_machine, calc_motor_targets
+from drakerock.lhd.model import add_machine
+from drakerock.lhd.motors import add_motors
 from drakerock.lhd.placement import set_machine_pose
 from drakerock.lhd.rocks import add_lhd_rocks
 from drakerock.rocks.drake.drift import AddDrift
@@ -119,14 +120,12 @@ class Dig:
         self.plant.Finalize()
         rates = make_dig(depth)
 
-        def delayed(t: float) -> np.ndarray:
-            wanted = rates(t - RELAXING) if t > RELAXING else (0.0, 0.0, 0.0)
-            return calc_motor_targets(self.plant, self.machine, *wanted)
+        def delayed(t: float) -> tuple[float, float, float]:
+            return rates(t - RELAXING) if t > RELAXING else (0.0, 0.0, 0.0)
 
-        motors = builder.AddSystem(Motors(delayed, len(delayed(0.0))))
+        motors = add_motors(builder, self.plant, self.machine)
         builder.Connect(
-            motors.GetOutputPort("desired_state"),
-            self.plant.get_desired_state_input_port(self.machine.instance),
+            builder.AddSystem(HeldRates(delayed)).get_output_port(), motors.GetInputPort("motor_speeds")
         )
         self.rocks = add_lhd_rocks(
             builder, self.plant, scene_graph, self.machine, pile, ROCKS, dynamics, SMALL_SITE,

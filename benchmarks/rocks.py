@@ -20,7 +20,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
 from drakerock.lhd.config import MachineConfig
-from drakerock.lhd.model import Machine, add_machine, calc_motor_targets
+from drakerock.lhd.model import Machine, add_machine
+from drakerock.lhd.motors import add_motors
 from drakerock.lhd.placement import set_machine_pose
 from drakerock.lhd.rocks import add_lhd_rocks
 from drakerock.loading.cycle import run_cycle
@@ -139,15 +140,15 @@ def bench_quality(pile: PileState) -> None:
 Rates = Callable[[float], tuple[float, float, float]]
 
 
-class Motors(LeafSystem):
-    def __init__(self, machine_rates: Callable[[float], np.ndarray], size: int) -> None:
+class HeldRates(LeafSystem):
+    def __init__(self, rates: Rates) -> None:
         super().__init__()
-        self._rates = machine_rates
+        self._rates = rates
         # Held over a step, as a digital controller's would be.
-        state = self.DeclareDiscreteState(size)
+        state = self.DeclareDiscreteState(3)
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(TIME_STEP, 0.0, self._update)
-        self.DeclareStateOutputPort("desired_state", state)
+        self.DeclareStateOutputPort("motor_speeds", state)
 
     def _update(self, context: Context, state: object) -> None:
         state.set_value(self._rates(context.get_time()))
@@ -195,10 +196,9 @@ def build_dig(
     AddDrift(plant, make_site(site), dynamics.plant)
     machine = add_machine(plant, MachineConfig())
     plant.Finalize()
-    size = len(calc_motor_targets(plant, machine, 0.0, 0.0, 0.0))
-    motors = builder.AddSystem(Motors(lambda t: calc_motor_targets(plant, machine, *rates(t)), size))
+    motors = add_motors(builder, plant, machine)
     builder.Connect(
-        motors.GetOutputPort("desired_state"), plant.get_desired_state_input_port(machine.instance)
+        builder.AddSystem(HeldRates(rates)).get_output_port(), motors.GetInputPort("motor_speeds")
     )
     rocks = add_lhd_rocks(builder, plant, scene_graph, machine, pile, ROCKS, dynamics, site, shapes=SHAPES)
     simulator = Simulator(builder.Build())

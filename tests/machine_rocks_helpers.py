@@ -9,7 +9,8 @@ from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from drakerock.lhd.config import MachineConfig
-from drakerock.lhd.model import add_machine, calc_motor_targets
+from drakerock.lhd.model import add_machine
+from drakerock.lhd.motors import add_motors
 from drakerock.lhd.placement import set_machine_pose
 from drakerock.lhd.rocks import add_lhd_rocks
 from drakerock.rocks.config import RocksConfig, SiteConfig
@@ -23,15 +24,10 @@ from drakerock.rocks.site import make_site
 class Rates(LeafSystem):
     """Joint rates of wheels, boom and bucket as a function of time."""
 
-    def __init__(self, plant, machine, rates: Callable[[float], tuple[float, float, float]]):
+    def __init__(self, rates: Callable[[float], tuple[float, float, float]]):
         super().__init__()
-        size = len(calc_motor_targets(plant, machine, 0, 0, 0))
         self.DeclareVectorOutputPort(
-            "desired_state",
-            size,
-            lambda context, output: output.SetFromVector(
-                calc_motor_targets(plant, machine, *rates(context.get_time()))
-            ),
+            "motor_speeds", 3, lambda context, output: output.SetFromVector(rates(context.get_time()))
         )
 
 
@@ -48,11 +44,9 @@ class Scene:
         AddDrift(self.plant, self.site, self.dynamics.plant)
         self.machine = add_machine(self.plant, MachineConfig())
         self.plant.Finalize()
-        source = builder.AddSystem(Rates(self.plant, self.machine, rates))
-        builder.Connect(
-            source.GetOutputPort("desired_state"),
-            self.plant.get_desired_state_input_port(self.machine.instance),
-        )
+        motors = add_motors(builder, self.plant, self.machine)
+        source = builder.AddSystem(Rates(rates))
+        builder.Connect(source.get_output_port(), motors.GetInputPort("motor_speeds"))
         self.rocks = add_lhd_rocks(
             builder, self.plant, self.scene_graph, self.machine, pile, rocks, self.dynamics, self.site.config,
             shapes=self.shapes,

@@ -597,6 +597,8 @@ def _show_progress(name: str, stopped: str = "") -> Iterator[Callable[..., None]
 
 
 def _print_outcome(outcome: Any) -> None:
+    from drakerock.loading.mining import describe_mining
+
     table = Table(title="Loading cycle", show_header=False, title_justify="left")
     table.add_column(style="bold")
     table.add_column()
@@ -623,6 +625,8 @@ def _print_outcome(outcome: Any) -> None:
     table.add_row("push force mean, peak", f"{show(_kilo(outcome.mean_push_force_N), '{:.0f}')}, "
                   f"{show(_kilo(outcome.peak_push_force_N), '{:.0f}')} kN")  # fmt: skip
     table.add_row("motors' work", show(_kilo(outcome.energy_J), "{:.0f} kJ"))
+    for label, text in describe_mining(outcome.mining or {}):
+        table.add_row(label, text)
     events = ", ".join(f"{item['event']} at {item['time_s']:.2f} s" for item in outcome.events) or "none"
     table.add_row("events", events)
     rocks = outcome.rocks
@@ -651,6 +655,15 @@ def _print_sequence(summary: dict[str, Any]) -> None:
         "weighed_mass_kg": ("weighed [kg]", "{:.0f}"),
         "loading_time_s": ("loading time [s]", "{:.2f}"),
         "energy_J": ("motors' work [J]", "{:.3g}"),
+        "payload_percent": ("payload [%]", "{:.1f}"),
+        "fill_factor": ("fill factor", "{:.2f}"),
+        "bucket_phase_kWh_per_t": ("energy of the bucket phase [kWh/t]", "{:.3f}"),
+        "loading_kWh_per_t": ("energy of the loading [kWh/t]", "{:.3f}"),
+        "tractive_effort_mean_N": ("tractive effort, mean [N]", "{:.3g}"),
+        "tractive_effort_peak_N": ("tractive effort, peak [N]", "{:.3g}"),
+        "wheel_slip_m": ("wheel slip [m]", "{:.2f}"),
+        "breakout_use": ("breakout use", "{:.2f}"),
+        "spillage_share": ("spillage share", "{:.4f}"),
         "wall_time_s": ("wall time of a cycle [s]", "{:.1f}"),
     }
     table.add_column("", no_wrap=True)
@@ -666,6 +679,9 @@ def _print_sequence(summary: dict[str, Any]) -> None:
         values = "  ".join("-" if value is None else form.format(value) for value in row["values"])
         table.add_row(Text(label), *numbers, values)  # text, not markup: the units' brackets stay
     output.print(table)
+    spread = summary["payload_spread_percent"]
+    if spread is not None:
+        output.print(f"payload spread: {spread:.1f} % of the mean load")
     events = ", ".join(f"{name} {count}" for name, count in summary["events"].items()) or "none"
     output.print(f"events: {events}", soft_wrap=True)
 

@@ -25,6 +25,8 @@ OWN_COLUMNS = (
     "p_optimal", "bucket_mass_kg", "bucket_rocks", "weighed_mass_kg", "loading_time_s", "energy_J",
     "peak_push_force_N", "mean_push_force_N", "sim_time_s", "steps", "seed", "scenario_hash", "wall_time_s",
     "rocks_total", "rocks_awake_mean", "rocks_awake_max", "seconds", "inputs_hash",
+    "load_t", "payload_percent", "fill_factor", "bucket_phase_kWh_per_t", "loading_kWh_per_t",
+    "tractive_effort_mean_N", "tractive_effort_peak_N", "wheel_slip_m", "breakout_use", "spillage_share",
 )  # fmt: skip
 # What is written beside an objective has its name and one of these.
 OBJECTIVE_SUFFIXES = ("_se", "_std", "_predicted", "_predicted_std", "_simulated", "_simulated_se", "_z")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+import math
+from itertools import pairwise
+
+from pydantic import Field, field_validator
 
 from drakerock.config import Config
 
@@ -14,6 +17,53 @@ class MotorConfig(Config):
     velocity: float | None = Field(
         default=None, gt=0, description="largest rate [rad/s]; none: as in the file"
     )
+
+
+class FunctionConfig(MotorConfig):
+    """A hydraulic function: the boom's lift or the bucket's tilt."""
+
+    holds: bool = Field(
+        default=True,
+        description="commanded to zero it holds like a closed valve; false: the method's compliance, torque over "
+        "motor_damping",
+    )
+    check_valve: bool = Field(
+        default=True, description="a load does not push it back against its command, if it holds"
+    )
+    relief: float | None = Field(
+        default=None, gt=0, description="torque at which the closed valve yields [N m]; none: the effort"
+    )
+
+
+NO_LOAD_SHARE = 1.2
+"""No-load speed of the wheels, over their largest commanded rate."""
+
+
+class WheelConfig(MotorConfig):
+    """A wheel's drive; `effort` is its torque at rest (stall)."""
+
+    torque_curve: tuple[tuple[float, float], ...] | None = Field(
+        default=((0.0, 1.0), (1.0, 0.0)),
+        description="speed over no-load speed and torque over stall torque, from [0, 1] to [1, 0]; null: the method's "
+        "constant limit",
+    )
+    no_load_speed: float | None = Field(
+        default=None, gt=0, description=f"[rad/s]; none: {NO_LOAD_SHARE} times the largest rate"
+    )
+
+    @field_validator("torque_curve")
+    @classmethod
+    def _check_curve(cls, curve: tuple[tuple[float, float], ...] | None) -> object:
+        if curve is None:
+            return curve
+        if len(curve) < 2 or curve[0] != (0.0, 1.0) or curve[-1] != (1.0, 0.0):
+            raise ValueError("expected points [speed share, torque share] from [0, 1] to [1, 0]")
+        # The shortest piece still has a slope that a step can be solved with.
+        if not all(b[0] - a[0] >= 1e-3 and b[1] <= a[1] for a, b in pairwise(curve)) or not all(
+            map(math.isfinite, sum(curve, ()))
+        ):
+            raise ValueError("expected speeds that rise by 0.001 at least and torques that do not")
+        return curve
 
 
 class MachineData(Config):
@@ -59,9 +109,9 @@ class MachineConfig(Config):
         default=SHIPPED_MODEL,
         description="the SDFormat file: a path, or package://drakerock/...",
     )
-    wheel: MotorConfig = MotorConfig()
-    boom: MotorConfig = MotorConfig()
-    bucket: MotorConfig = MotorConfig()
+    wheel: WheelConfig = WheelConfig()
+    boom: FunctionConfig = FunctionConfig()
+    bucket: FunctionConfig = FunctionConfig()
     motor_damping: float | None = Field(
         default=None, gt=0, description="velocity gain of the three motors [N m s/rad]; none: as in the file"
     )

@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
-import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 
 from drakerock.errors import InputError
 from drakerock.lhd import names
-from drakerock.lhd.config import MachineConfig, MotorConfig
+from drakerock.lhd.config import NO_LOAD_SHARE, FunctionConfig, MachineConfig, MotorConfig, WheelConfig
 from drakerock.lhd.model_file import Loop, check_machine_file, parse_machine
-
-
-@dataclass(frozen=True)
-class MotorLimits:
-    """A motor's limits: `effort` [N m], `velocity` [rad/s]."""
-
-    effort: float
-    velocity: float
+from drakerock.lhd.motor_law import Motor
 
 
 @dataclass(frozen=True)
@@ -32,7 +24,7 @@ class Machine:
     Attributes:
         instance: the model instance of all its elements.
         config: what it was made from.
-        wheel, boom, bucket: limits of one wheel's, the boom's and the bucket's motor.
+        wheel, boom, bucket: the motors of one wheel, the boom and the bucket.
         steering_angle: angle held at the articulation [rad].
         loops: the linkage's closed loops.
         ignored: what stands in its file without any effect, a line each.
@@ -40,9 +32,9 @@ class Machine:
 
     instance: ModelInstanceIndex
     config: MachineConfig
-    wheel: MotorLimits
-    boom: MotorLimits
-    bucket: MotorLimits
+    wheel: Motor
+    boom: Motor
+    bucket: Motor
     steering_angle: float
     loops: tuple[Loop, ...]
     ignored: tuple[str, ...]
@@ -51,8 +43,8 @@ class Machine:
 def add_machine(plant: MultibodyPlant, config: MachineConfig) -> Machine:
     """Parse the machine into `plant` (before Finalize) and set its motors.
 
-    The motors are velocity motors (section 2): position gain 0, a large velocity gain, an effort limit; the
-    discrete solver treats them implicitly. The articulation's actuator holds the steering angle.
+    The motors' actuators have position gain 0, a large velocity gain and an effort limit (section 2); the discrete
+    solver treats them implicitly. `add_motors` drives them. The articulation's actuator holds the steering angle.
 
     Raises:
         InputError: no such file, or something in it that cannot be used (`check_machine_file`).
@@ -82,41 +74,6 @@ def add_machine(plant: MultibodyPlant, config: MachineConfig) -> Machine:
     )
 
 
-def calc_motor_targets(
-    plant: MultibodyPlant,
-    machine: Machine,
-    wheel: float,
-    boom: float,
-    bucket: float,
-    steering_angle: float | None = None,
-) -> np.ndarray:
-    """Return the desired state [q, v] for ``plant.get_desired_state_input_port(machine.instance)``.
-
-    Args:
-        plant: the finalized plant.
-        machine: the machine in it.
-        wheel, boom, bucket: wanted joint rates [rad/s]; clamped to the motors' velocity limits.
-        steering_angle: wanted angle of the articulation [rad]; none: the machine's.
-
-    Returns:
-        (2 n,) positions (only the articulation's counts) and velocities of the n actuators, in Drake's order.
-    """
-    rates = {
-        "articulation": 0.0,
-        "boom_joint": float(np.clip(boom, -machine.boom.velocity, machine.boom.velocity)),
-        "bucket_joint": float(np.clip(bucket, -machine.bucket.velocity, machine.bucket.velocity)),
-    }
-    wheel = float(np.clip(wheel, -machine.wheel.velocity, machine.wheel.velocity))
-    joints = [
-        plant.get_joint_actuator(index).joint().name()
-        for index in plant.GetJointActuatorIndices(machine.instance)
-    ]
-    if steering_angle is None:
-        steering_angle = machine.steering_angle
-    positions = [steering_angle if name == "articulation" else 0.0 for name in joints]
-    return np.array(positions + [rates.get(name, wheel) for name in joints])
-
-
 @cache
 def _warn_of(lines: tuple[str, ...]) -> None:
     """Tell once a process."""
@@ -125,15 +82,28 @@ def _warn_of(lines: tuple[str, ...]) -> None:
 
 
 def _apply_motor(
-    plant: MultibodyPlant, instance: ModelInstanceIndex, name: str, motor: MotorConfig, config: MachineConfig
-) -> MotorLimits:
+    plant: MultibodyPlant,
+    instance: ModelInstanceIndex,
+    name: str,
+    config: MotorConfig,
+    machine: MachineConfig,
+) -> Motor:
     actuator = plant.GetJointActuatorByName(name, instance)
     joint = plant.GetJointByName(name, instance)
-    if motor.effort is not None:
-        actuator.set_effort_limit(motor.effort)
-    damping = config.motor_damping
+    damping = machine.motor_damping
     if damping is None:
         damping = actuator.get_controller_gains().d
+    effort = float(actuator.effort_limit()) if config.effort is None else config.effort
+    velocity = float(joint.velocity_upper_limits()[0]) if config.velocity is None else config.velocity
+    motor = Motor(effort, velocity, damping)
+    if isinstance(config, FunctionConfig):
+        relief = effort if config.relief is None else config.relief
+        motor = replace(motor, holds=config.holds, check_valve=config.check_valve, relief=relief)
+    elif isinstance(config, WheelConfig) and config.torque_curve:
+        no_load = NO_LOAD_SHARE * velocity if config.no_load_speed is None else config.no_load_speed
+        curve = tuple((no_load * rate, effort * torque) for rate, torque in config.torque_curve)
+        motor = replace(motor, curve=curve)
+    actuator.set_effort_limit(motor.peak)
     actuator.set_controller_gains(PdControllerGains(p=0.0, d=damping))
-    velocity = float(joint.velocity_upper_limits()[0]) if motor.velocity is None else motor.velocity
-    return MotorLimits(float(actuator.effort_limit()), velocity)
+    joint.set_default_damping_vector(joint.default_damping_vector() + motor.drag)
+    return motor

@@ -273,7 +273,7 @@ class _Check:
         return self.plant.GetJointActuatorByName(joint, self.instance)
 
     def _check_motors(self) -> None:
-        motors = {"boom_joint": self.config.boom, "bucket_joint": self.config.bucket}
+        motors: dict[str, MotorConfig] = {"boom_joint": self.config.boom, "bucket_joint": self.config.bucket}
         motors |= dict.fromkeys(names.WHEEL_JOINTS, self.config.wheel)
         for name, motor in motors.items():
             actuator = self._get_actuator(name)

@@ -85,6 +85,15 @@ class PlanningConfig(Config):
     n_segment: Annotated[int, Field(ge=10, le=2000, description="path points a segment")] = 60
 
 
+class WeightTransferConfig(Config):
+    """Raising the boom during the push: the pile's weight on the bucket loads the front wheels."""
+
+    height: Annotated[
+        float, Field(ge=0, le=1, description="how far the tip is raised on [s0, s1]; 0: not at all [m]")
+    ] = 0.0
+    rate: Annotated[float, Field(gt=0, le=1, description="the boom's rate meanwhile [rad/s]")] = 0.02
+
+
 class ControlConfig(Config):
     """The feed-forward controller."""
 
@@ -93,6 +102,7 @@ class ControlConfig(Config):
     ] = 0.1
     timeout: Annotated[float, Field(gt=0, description="allowed beyond a segment's planned time [s]")] = 5.0
     approach_time: Annotated[float, Field(gt=0, description="allowed from the start to s0 [s]")] = 20.0
+    weight_transfer: WeightTransferConfig = WeightTransferConfig()
 
 
 class SteeringConfig(Config):
@@ -126,6 +136,10 @@ class PerformanceConfig(Config):
         Field(gt=0, description="critical hinge moment [N m]; null: machine.expected.critical_moment"),
     ] = None
     t_char: Annotated[float, Field(gt=0, description="characteristic time of the damage integral [s]")] = 12.0
+    loose_packing: Annotated[
+        float,
+        Field(gt=0, le=1, description="share of solid rock in the load's loose volume, for the fill factor"),
+    ] = 0.58
     settle_time: Annotated[
         float, Field(ge=0, le=60, description="at most this long after s4 for the rocks to rest [s]")
     ] = 6.0

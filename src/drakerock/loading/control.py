@@ -9,10 +9,14 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drakerock.lhd.kinematics import Kinematics
 from drakerock.lhd.measurement import MEASUREMENT
+from drakerock.loading.config import WeightTransferConfig
 from drakerock.loading.plan import DigPlan, NoPlan, calc_motor_rates, clamp_rates
 from drakerock.loading.segments import Mode
 
 Array = NDArray[np.float64]
+
+# The last bit of the raise for weight transfer, in which its rate fades out [m].
+RAISE_RAMP = 0.02
 
 
 def project_on_path(plan: DigPlan, segment: int, x: float, z: float) -> int:
@@ -24,8 +28,28 @@ def project_on_path(plan: DigPlan, segment: int, x: float, z: float) -> int:
     return int(points[np.argmin(distance)])
 
 
+def calc_raise(plan: DigPlan, z: float, config: WeightTransferConfig) -> float:
+    """Return the boom's rate that transfers weight during the push [rad/s]; it fades out at the wanted height.
+
+    Args:
+        plan: the plan.
+        z: the tip's height [m].
+        config: how far and how fast.
+    """
+    if config.height == 0.0:
+        return 0.0
+    left = float(plan.waypoint_z[0]) + config.height - z
+    return -config.rate * min(max(left / RAISE_RAMP, 0.0), 1.0)
+
+
 def calc_motor_speeds(
-    plan: DigPlan, mode: Mode, kinematics: Kinematics, x: float, z: float, psi: float
+    plan: DigPlan,
+    mode: Mode,
+    kinematics: Kinematics,
+    x: float,
+    z: float,
+    psi: float,
+    weight_transfer: WeightTransferConfig | None = None,
 ) -> Array:
     """Return the motors' target speeds [wheel, boom, bucket] [rad/s].
 
@@ -39,9 +63,12 @@ def calc_motor_speeds(
         kinematics: the machine's geometry.
         x, z: tip position in W [m].
         psi: bucket pitch [rad].
+        weight_transfer: of the push; None: none.
     """
     if mode in (Mode.APPROACH, Mode.S0):
         speeds = np.array([plan.drive_speed / kinematics.wheel_radius, 0.0, 0.0])
+        if mode == Mode.S0 and weight_transfer:
+            speeds[1] = calc_raise(plan, z, weight_transfer)
     elif mode == Mode.S1:
         at = project_on_path(plan, 1, x, z)
         v_z = plan.v_z.calc(z) if z < plan.v_z.at[-1] else 0.0
@@ -69,10 +96,11 @@ class FeedforwardController(LeafSystem):
     Output port ``motor_speeds``: (3,) targets of wheels, boom and bucket [rad/s].
     """
 
-    def __init__(self, kinematics: Kinematics) -> None:
+    def __init__(self, kinematics: Kinematics, weight_transfer: WeightTransferConfig | None = None) -> None:
         """Make the controller of a machine."""
         super().__init__()
         self.set_name("feedforward_controller")
+        self._weight_transfer = weight_transfer
         self._kinematics = kinematics
         self._indices = [list(MEASUREMENT).index(name) for name in ("x_T", "z_T", "psi")]
         self._plan = self.DeclareAbstractInputPort("plan", AbstractValue.Make(NoPlan("")))
@@ -90,5 +118,7 @@ class FeedforwardController(LeafSystem):
             return
         measured = self._measurement.Eval(context)
         mode = Mode(int(self._mode.Eval(context)[0]))
-        tip = (float(measured[k]) for k in self._indices)
-        output.SetFromVector(calc_motor_speeds(plan, mode, self._kinematics, *tip))
+        x, z, psi = (float(measured[k]) for k in self._indices)
+        output.SetFromVector(
+            calc_motor_speeds(plan, mode, self._kinematics, x, z, psi, self._weight_transfer)
+        )

@@ -14,10 +14,12 @@ from pydrake.systems.framework import Context, EventStatus
 
 from drakerock.errors import SimulationFailure
 from drakerock.files import make_folder, write_text
+from drakerock.lhd.geometry import calc_heaped_capacity
 from drakerock.loading.evaluation import make_outcome
 from drakerock.loading.field import HeightField
 from drakerock.loading.field_file import save_height_fields
 from drakerock.loading.folder import HEIGHT_FIELDS
+from drakerock.loading.mining import MachineRating
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.performance import Weighing, find_bucket_load, find_debris, find_lost
 from drakerock.loading.plan import DigPlan, NoPlan
@@ -122,6 +124,7 @@ def run_cycle(
         cycle.weighing,
         failure,
         cycle.at_rest,
+        _make_rating(station),
         wall_time=clock.perf_counter() - start[0],
         cpu_time=clock.process_time() - start[1],
     )
@@ -247,6 +250,18 @@ class _Cycle:
         moved = np.linalg.norm(now.p_WRs - self._last_pile.p_WRs, axis=1)[~self.load]
         self.at_rest = bool(np.all(moved < limits.rest_speed * (time - self._last_check)))
         self._last_check, self._last_pile = time, now
+
+
+def _make_rating(station: Station) -> MachineRating:
+    """Return what the numbers of mining are relative to."""
+    scenario = station.scenario
+    return MachineRating(
+        payload=scenario.machine.expected.payload,
+        capacity=calc_heaped_capacity(station.digger.bucket),
+        loose_density=scenario.rocks.density * scenario.loading.performance.loose_packing,
+        wheel_radius=station.digger.kinematics.wheel_radius,
+        bucket_effort=station.machine.bucket.peak,
+    )
 
 
 def _make_notes(outcome: CycleOutcome) -> dict[str, object]:

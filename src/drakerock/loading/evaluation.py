@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drakerock.identity import calc_config_hash, get_versions
+from drakerock.loading.mining import MachineRating, calc_mining_numbers
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.performance import Weighing, calc_damage, find_events, find_weighing_events
 from drakerock.loading.plan import DigPlan, NoPlan
@@ -30,6 +31,7 @@ def make_outcome(
     weighing: Weighing | None,
     failure: str | None,
     at_rest: bool,
+    rating: MachineRating,
     wall_time: float,
     cpu_time: float,
 ) -> CycleOutcome:
@@ -46,6 +48,7 @@ def make_outcome(
         weighing: the machine on the scale, if it came to that.
         failure: why the dynamics failed, if they did.
         at_rest: whether the rocks rested when debris was counted.
+        rating: what the numbers of mining are relative to.
         wall_time, cpu_time: cost of the cycle [s].
     """
     times = controller[WAYPOINT_TIMES]
@@ -120,6 +123,9 @@ def make_outcome(
         peak_push_force_N=peak,
         mean_push_force_N=mean,
         energy_J=energy,
+        mining=calc_mining_numbers(signals, times, load, float(masses[debris].sum()), rating)
+        if phi
+        else None,
         events=events,
         rocks={
             "total": len(masses),

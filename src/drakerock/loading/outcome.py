@@ -26,6 +26,7 @@ class CycleOutcome:
         plan: swept and wanted volume, whether the wanted one could be reached, entry point, slope, dig height.
         peak_push_force_N, mean_push_force_N: of the rocks against the bucket's motion into the pile.
         energy_J: the motors' work over [t0, t4].
+        mining: the numbers that mines judge a loading by, see `drakerock.loading.mining.MINING`; null after a failure.
         events: stalls, slips, time-outs, a load that changed after s4 or differs from its weight, and rocks
             that still moved when debris was counted, with their times.
         rocks: number in all, awake at most and on average; the deepest penetration [m]; how many left the site;
@@ -52,6 +53,7 @@ class CycleOutcome:
     peak_push_force_N: float | None
     mean_push_force_N: float | None
     energy_J: float | None
+    mining: dict[str, float | None] | None = field(default=None, kw_only=True)
     events: list[dict[str, Any]]
     rocks: dict[str, float]
     wall_time_s: float

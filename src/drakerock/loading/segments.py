@@ -47,7 +47,7 @@ def calc_passed(
 ) -> bool:
     """Return whether the waypoint that ends `mode` is passed: s0, s1, s4 by x, s2 by x or z, s3 by psi.
 
-    s3 is also passed at the full-tilt stop: a boom that sags under its load, or a chassis that pitches, can
+    s3 is also passed at the full-tilt stop: a boom that yields to its load, or a chassis that pitches, can
     leave the bucket at its stop with psi short of the plan, and nothing is left to turn then.
 
     Args:

@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import (
-    BasicVector,
     Context,
     Diagram,
     DiagramBuilder,
-    LeafSystem,
     OutputPort,
     System,
 )
@@ -24,7 +22,8 @@ from drakerock.lhd.geometry import collision_pieces, make_bucket_geometry
 from drakerock.lhd.hinge import add_hinge_moment
 from drakerock.lhd.kinematics import make_kinematics
 from drakerock.lhd.measurement import add_machine_sensor
-from drakerock.lhd.model import Machine, add_machine, calc_motor_targets
+from drakerock.lhd.model import Machine, add_machine
+from drakerock.lhd.motors import add_motors
 from drakerock.lhd.placement import set_machine_pose
 from drakerock.lhd.rocks import add_lhd_rocks
 from drakerock.lhd.wall_contact import add_wall_contact
@@ -123,32 +122,6 @@ class Station:
         )
 
 
-class MotorTargets(LeafSystem):
-    """Orders the controller's three speeds and the steering angle as the plant's desired state.
-
-    Input ports:
-        ``motor_speeds``: (3,) wheels, boom, bucket [rad/s].
-        ``steering_angle``: (1,) of the articulation [rad]; unconnected: the machine's.
-
-    Output port ``desired_state``: as the plant's desired-state port of the machine wants it.
-    """
-
-    def __init__(self, plant: MultibodyPlant, machine: Machine) -> None:
-        """Make it for `machine` in the finalized `plant`."""
-        super().__init__()
-        self.set_name("motor_targets")
-        self._plant, self._machine = plant, machine
-        self._speeds = self.DeclareVectorInputPort("motor_speeds", 3)
-        self._angle = self.DeclareVectorInputPort("steering_angle", 1)
-        size = len(calc_motor_targets(plant, machine, 0.0, 0.0, 0.0))
-        self.DeclareVectorOutputPort("desired_state", size, self._calc, {self.all_input_ports_ticket()})
-
-    def _calc(self, context: Context, output: BasicVector) -> None:
-        angle = float(self._angle.Eval(context)[0]) if self._angle.HasValue(context) else None
-        wheel, boom, bucket = (float(speed) for speed in self._speeds.Eval(context))
-        output.SetFromVector(calc_motor_targets(self._plant, self._machine, wheel, boom, bucket, angle))
-
-
 def make_station(
     scenario: Scenario,
     pile: PileState,
@@ -190,10 +163,7 @@ def make_station(
     digger = make_digging_machine(plant, scene_graph, machine)
     bucket = plant.GetBodyByName("bucket", machine.instance).index()
 
-    motors = builder.AddSystem(MotorTargets(plant, machine))
-    builder.Connect(
-        motors.GetOutputPort("desired_state"), plant.get_desired_state_input_port(machine.instance)
-    )
+    motors = add_motors(builder, plant, machine)
     rocks = add_lhd_rocks(
         builder, plant, scene_graph, machine, pile, scenario.rocks, dynamics, scenario.site,
         shapes=shapes, bodies=bodies, visible=visible,
@@ -212,7 +182,11 @@ def make_station(
     )
     controller_system = builder.AddSystem(
         make_part(
-            "controller", controller, parts.controller, view, lambda: FeedforwardController(digger.kinematics)
+            "controller",
+            controller,
+            parts.controller,
+            view,
+            lambda: FeedforwardController(digger.kinematics, loading.control.weight_transfer),
         )
     )
     tracker = controller_system
@@ -251,7 +225,8 @@ def make_station(
 
     signals |= {
         "motor_speeds": motor_speeds,
-        "torques": plant.get_net_actuation_output_port(machine.instance),
+        "net_actuation": plant.get_net_actuation_output_port(machine.instance),
+        "motor_bias": motors.GetOutputPort("bias"),
         "wall_contact": walls.GetOutputPort("wall_contact"),
     }
     logs = {}
@@ -283,8 +258,8 @@ def make_station(
 
 
 LOGGED = (
-    "measurement", "motor_speeds", "mode", "torques", "machine_state", "hinge_moment", "bucket_force", "rock_summary",
-    "wall_contact",
+    "measurement", "motor_speeds", "mode", "net_actuation", "motor_bias", "machine_state", "hinge_moment",
+    "bucket_force", "rock_summary", "wall_contact",
 )  # fmt: skip
 """Signals that are logged in every step."""
 EXPORTED = ("measurement", "plan", "height_field", "mode", "progress", "motor_speeds", "pile", "bucket_force")

@@ -15,6 +15,7 @@ from drakerock.exploration.noise import calc_standard_error
 from drakerock.files import make_folder, write_text
 from drakerock.loading.cycle import run_cycle, save_cycle
 from drakerock.loading.live import make_live_station
+from drakerock.loading.mining import MINING
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.recording import load_recording
 from drakerock.loading.scenario import Scenario, make_recipe
@@ -140,21 +141,28 @@ def calc_sequence_summary(outcomes: list[CycleOutcome]) -> dict[str, Any]:
     """Return what a sequence came to: per quantity mean, spread and standard error, what ended each loading, and how
     often each event happened.
 
-    The spread is the standard deviation of single loadings; the standard error of the mean allows for
-    successive loadings resembling each other (`drakerock.exploration.noise`). Failed loadings count in neither;
-    null where there are too few values.
+    The spread is the standard deviation of single loadings, ``payload_spread_percent`` that of the load over its
+    mean; the standard error of the mean allows for successive loadings resembling each other
+    (`drakerock.exploration.noise`). Failed loadings count in neither; null where there are too few values.
     """
     objectives = ("production", "damage", "debris")
     values = {name: [outcome.objectives[name] for outcome in outcomes] for name in objectives}
     for name in ("bucket_mass_kg", "weighed_mass_kg", "loading_time_s", "energy_J", "wall_time_s"):
         values[name] = [getattr(outcome, name) for outcome in outcomes]
+    for name in MINING:
+        values[name] = [(outcome.mining or {}).get(name) for outcome in outcomes]
+    quantities = {name: _summarise(column) for name, column in values.items()}
+    payload = quantities["bucket_mass_kg"]
     return {
         "loadings": len(outcomes),
         "failed": sum(outcome.status == "failed" for outcome in outcomes),
         "strategy": outcomes[0].strategy if outcomes else None,
         "reasons": [outcome.reason for outcome in outcomes],
         "events": dict(Counter(item["event"] for outcome in outcomes for item in outcome.events or ())),
-        "quantities": {name: _summarise(column) for name, column in values.items()},
+        "quantities": quantities,
+        "payload_spread_percent": 100.0 * payload["spread"] / payload["mean"]
+        if payload["spread"] is not None and payload["mean"]
+        else None,
         "scenario_hash": outcomes[0].scenario_hash if outcomes else None,
     }
 

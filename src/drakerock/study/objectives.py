@@ -148,3 +148,39 @@ def _calc_specific_energy(outcome: CycleOutcome) -> float | None:
 )
 def _get_peak_force(outcome: CycleOutcome) -> float | None:
     return outcome.peak_push_force_N
+
+
+def _register_mining(key: str, objective: Objective) -> None:
+    """Register one of the numbers of `drakerock.loading.mining`; without a load, those per tonne have their worst."""
+
+    @register_objective(objective)
+    def get_number(outcome: CycleOutcome) -> float | None:
+        if outcome.mining is None:
+            return None
+        if objective.unit == "kWh/t" and outcome.mining["load_t"] == 0.0:
+            return math.inf
+        return outcome.mining[key]
+
+
+for _key, _objective in {
+    "payload_percent": Objective(
+        name="payload", sense="max", unit="%", meaning="load over the machine's payload"
+    ),
+    "fill_factor": Objective(
+        name="fill", sense="max", meaning="loose volume of the load over the bucket's heaped capacity"
+    ),
+    # As of specific_energy: 1e4 J/kg.
+    "bucket_phase_kWh_per_t": Objective(
+        name="digging_energy",
+        unit="kWh/t",
+        meaning="the motors' work until the bucket is tilted, per tonne",
+        worst=2.8,
+    ),
+    "loading_kWh_per_t": Objective(
+        name="loading_energy", unit="kWh/t", meaning="the motors' work of a loading per tonne", worst=2.8
+    ),
+    "wheel_slip_m": Objective(name="slip_distance", unit="m", meaning="way of the tyres that slips"),
+    "breakout_use": Objective(name="breakout", meaning="largest torque of the bucket's motor over its limit"),
+    "spillage_share": Objective(name="spillage", meaning="debris over load and debris", worst=1.0),
+}.items():
+    _register_mining(_key, _objective)

@@ -114,8 +114,9 @@ def _flatten(outcome: dict[str, Any]) -> dict[str, Any]:
     for name, value in outcome.items():
         if name in ("objectives", "phi1", "phi2", "phi3", "strategy", "files", "versions"):
             continue  # in columns of their own, or the same for all
+        prefix = "" if name == "mining" else f"{name}_"  # the numbers of mining have names of their own
         items = (
-            {f"{name}_{key}": item for key, item in value.items()}
+            {f"{prefix}{key}": item for key, item in value.items()}
             if isinstance(value, dict)
             else {name: value}
         )

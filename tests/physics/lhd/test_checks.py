@@ -13,7 +13,7 @@ from drakerock.config import load_config
 from drakerock.lhd.checks.bench import CheckConfig
 from drakerock.lhd.checks.checks import run_machine_checks
 from drakerock.lhd.checks.rows import make_check_data, make_check_table
-from drakerock.lhd.config import MachineConfig, MotorConfig
+from drakerock.lhd.config import FunctionConfig, MachineConfig, WheelConfig
 
 SMALL = load_config(Path(__file__).with_name("lhd_small.yaml"), MachineConfig)
 
@@ -65,7 +65,7 @@ def test_other_contact_models_differ_for_sliding_tyres_only(contact):
 def test_faults_are_found():
     """A weak tilt motor, wheels that stall before they slip, and a payload too heavy for the boom."""
     config = MachineConfig(
-        bucket=MotorConfig(effort=5e5), wheel=MotorConfig(effort=1.2e5), boom=MotorConfig(effort=7e5)
+        bucket=FunctionConfig(effort=5e5), wheel=WheelConfig(effort=1.2e5), boom=FunctionConfig(effort=7e5)
     )
     failed = get_failed(run_machine_checks(config))
     assert {"breakout force, chassis held", "traction against a wall"} <= failed

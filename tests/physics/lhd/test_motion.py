@@ -7,7 +7,7 @@ import pytest
 from pydrake.math import RollPitchYaw
 
 from drakerock.lhd.checks.bench import Bench, CheckConfig, make_bench
-from drakerock.lhd.config import MachineConfig
+from drakerock.lhd.config import FunctionConfig, MachineConfig
 from drakerock.lhd.kinematics import calc_bucket_range, calc_joint_angles, calc_joint_rates, calc_tip
 from drakerock.lhd.placement import set_machine_angles, set_machine_pose
 
@@ -64,18 +64,19 @@ def test_steered_machine_turns():
     assert position[1] > 0.3
 
 
-def test_stands_still_and_at_equilibrium():
-    """Placed at its static equilibrium: nothing moves but the boom, by its motor's compliance."""
-    bench = make()
+@pytest.mark.parametrize("holds", [True, False])
+def test_stands_still_and_at_equilibrium(holds):
+    """Placed at its static equilibrium: nothing moves, but a boom that does not hold, by its motor's compliance."""
+    bench = make(MachineConfig(boom=FunctionConfig(holds=holds)))
     place(bench, x_tip=0.0, z_tip=0.5)
     record = bench.run(1.0)
     q = record.q - record.q[0]
     front = bench.get_body("front_unit").floating_positions_start()
     assert np.abs(q[:, front : front + 7]).max() < 1e-4
     torque = np.abs(record.effort[:, bench.get_column("boom_joint")]).max()
-    sag = record.q[-1] - record.q[0]
-    boom = sag[bench.plant.GetJointByName("boom_joint").position_start()]
-    assert boom == pytest.approx(1e-8 * torque * 0.99, rel=0.05)
+    boom = q[-1, bench.plant.GetJointByName("boom_joint").position_start()]
+    expected = 0.0 if holds else 1e-8 * torque * 0.99
+    assert boom == pytest.approx(expected, rel=0.05, abs=5e-6)
 
 
 def test_follows_the_inverse_kinematics():

@@ -23,7 +23,7 @@ from drakerock.lhd.geometry import (
     make_bucket_geometry,
 )
 from drakerock.lhd.linkage import Linkage, find_passive_joints
-from drakerock.lhd.model import add_machine, calc_motor_targets
+from drakerock.lhd.model import add_machine
 from drakerock.lhd.placement import set_machine_angles, set_machine_pose
 from drakerock.resources import find_data
 
@@ -76,14 +76,28 @@ def test_config_overrides_the_file(build):
     assert machine.boom.effort == 2e6
 
 
-def test_motor_targets_are_clamped_and_in_order(model):
-    _, plant, _, machine = model
-    targets = calc_motor_targets(plant, machine, wheel=9.0, boom=-9.0, bucket=0.3)
-    count = plant.num_actuators()
-    assert targets.shape == (2 * count,)
-    rates = dict(zip(plant.GetActuatorNames(machine.instance), targets[count:], strict=True))
-    expected = {"articulation": 0.0, "boom_joint": -1.0, "bucket_joint": 0.3}
-    assert rates == expected | dict.fromkeys(names.WHEEL_JOINTS, 1.3)
+def test_motors_follow_the_configuration(build):
+    text = "{boom: {relief: 2.5e+6}, bucket: {holds: false}, wheel: {no_load_speed: 2.0}}"
+    _, plant, _, machine = build(parse_config(text, MachineConfig))
+    assert plant.GetJointActuatorByName("boom_joint", machine.instance).effort_limit() == 2.5e6
+    assert (machine.boom.effort, machine.boom.holds, machine.boom.check_valve) == (2e6, True, True)
+    assert (machine.bucket.peak, machine.bucket.holds) == (8e5, False)
+    assert machine.wheel.curve == ((0.0, 1.9e5), (2.0, 0.0))
+    drag = plant.GetJointByName(names.WHEEL_JOINTS[0], machine.instance).default_damping_vector()
+    assert drag == pytest.approx(1.9e5 / 2.0)
+    _, plant, _, machine = build(parse_config("{wheel: {torque_curve: null}}", MachineConfig))
+    assert machine.wheel.curve == ()
+    assert not plant.GetJointByName(names.WHEEL_JOINTS[0], machine.instance).default_damping_vector().any()
+
+
+@pytest.mark.parametrize(
+    "curve",
+    ["[]", "[[0, 1]]", "[[0, 1], [0.5, 0]]", "[[0, 1], [0.5, 0.4], [0.6, 0.5], [1, 0]]",
+     "[[0, 1], [0.5, 0.4], [0.5, 0.2], [1, 0]]", "[[0.1, 1], [1, 0]]"],
+)  # fmt: skip
+def test_torque_curves_that_make_no_sense_are_refused(curve):
+    with pytest.raises(InputError, match=r"wheel\.torque_curve: expected"):
+        parse_config(f"wheel: {{torque_curve: {curve}}}", MachineConfig)
 
 
 def test_missing_file_and_steering_out_of_range():

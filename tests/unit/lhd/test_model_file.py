@@ -13,7 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drakerock.errors import InputError
 from drakerock.lhd import tracing
-from drakerock.lhd.config import MachineConfig, MotorConfig
+from drakerock.lhd.config import FunctionConfig, MachineConfig
 from drakerock.lhd.kinematics import make_kinematics
 from drakerock.lhd.model import Machine, add_machine
 from drakerock.lhd.model_file import check_machine_file
@@ -242,7 +242,7 @@ def test_loops_are_the_files(model):
 
 def test_config_gives_the_limits_that_the_file_lacks(tmp_path):
     file = write_sdf(tmp_path, (in_joint("boom_joint", r"<velocity>[^<]*</velocity>"), r"\1"))
-    _, machine = make(file, boom=MotorConfig(velocity=0.7))
+    _, machine = make(file, boom=FunctionConfig(velocity=0.7))
     assert machine.boom.velocity == 0.7
 
 

@@ -7,8 +7,8 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from drakerock.lhd.kinematics import calc_jacobian, calc_pitch, calc_tip
 from drakerock.lhd.measurement import MEASUREMENT
-from drakerock.loading.config import ControlConfig
-from drakerock.loading.control import FeedforwardController, calc_motor_speeds
+from drakerock.loading.config import ControlConfig, WeightTransferConfig
+from drakerock.loading.control import RAISE_RAMP, FeedforwardController, calc_motor_speeds
 from drakerock.loading.plan import NoPlan
 from drakerock.loading.segments import (
     TIMEOUTS,
@@ -135,3 +135,20 @@ def test_without_a_plan_it_aborts_and_stands_still(digger):
     progress, speeds = run_alone(digger, NoPlan("nothing there"), np.zeros(len(MEASUREMENT)), 0.1)
     assert progress[0] == Mode.ABORTED
     assert np.all(speeds == 0)
+
+
+def test_weight_is_transferred_during_the_push_alone(plan, digger):
+    """The boom is raised at its rate, fades out at the height, and never lowers; nothing else changes."""
+    kin = digger.kinematics
+    transfer = WeightTransferConfig(height=0.15, rate=0.03)
+    x, floor = float(plan.waypoint_x[0]) + 0.1, float(plan.waypoint_z[0])
+    for mode in Mode:
+        plain = calc_motor_speeds(plan, mode, kin, x, floor, 0.0)
+        assert (calc_motor_speeds(plan, mode, kin, x, floor, 0.0, WeightTransferConfig()) == plain).all()
+        changed = calc_motor_speeds(plan, mode, kin, x, floor, 0.0, transfer) - plain
+        assert changed.tolist() == ([0.0, -0.03, 0.0] if mode == Mode.S0 else [0.0, 0.0, 0.0])
+    rates = [
+        calc_motor_speeds(plan, Mode.S0, kin, x, floor + lift, 0.0, transfer)[1]
+        for lift in (-0.05, 0.15 - RAISE_RAMP, 0.15 - RAISE_RAMP / 2, 0.15, 0.3)
+    ]
+    assert rates == pytest.approx([-0.03, -0.03, -0.015, 0.0, 0.0], abs=1e-12)

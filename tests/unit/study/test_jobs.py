@@ -1,4 +1,4 @@
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -37,6 +37,18 @@ def test_summary_of_a_sequence():
     assert row["values"] == productions
     assert summary["quantities"]["damage"]["spread"] == 0.0
     assert summary["quantities"]["bucket_mass_kg"]["mean"] is None
+
+
+def test_spread_of_the_payload():
+    loads = [10e3, 12e3, 14e3]
+    outcomes = [
+        replace(make_outcome(1.0), bucket_mass_kg=load, mining={"load_t": load / 1e3}) for load in loads
+    ]
+    summary = calc_sequence_summary(outcomes)
+    assert summary["payload_spread_percent"] == pytest.approx(100 * 2e3 / 12e3)
+    assert summary["quantities"]["load_t"]["mean"] == pytest.approx(12.0)
+    assert summary["quantities"]["fill_factor"]["mean"] is None
+    assert calc_sequence_summary(outcomes[:1])["payload_spread_percent"] is None
 
 
 def test_loadings_that_drift_are_less_certain_than_ones_that_scatter():

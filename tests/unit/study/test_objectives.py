@@ -13,6 +13,7 @@ from drakerock.config import parse_config
 from drakerock.errors import InputError
 from drakerock.exploration.problem import Objective
 from drakerock.exploration.table import ResponseTable
+from drakerock.loading.mining import MINING
 from drakerock.study.objectives import (
     RegisteredObjective,
     get_objective,
@@ -114,6 +115,26 @@ def test_an_empty_bucket_takes_the_worst_energy():
     assert item.evaluate(Outcome) == item.objective.worst
     Outcome.bucket_mass_kg = None
     assert math.isnan(item.evaluate(Outcome))
+
+
+def test_numbers_of_mining_are_objectives():
+    class Outcome:
+        mining = dict.fromkeys(MINING, 0.5)
+
+    names = ["payload", "fill", "digging_energy", "loading_energy", "slip_distance", "breakout", "spillage"]
+    items = [get_objective(name) for name in names]
+    assert [item.evaluate(Outcome) for item in items] == [0.5] * 7
+    assert [item.objective.sense for item in items] == ["max", "max", *["min"] * 5]
+    # Without a load: the worst energy, and no value where there is none.
+    Outcome.mining = dict.fromkeys(MINING) | {"load_t": 0.0, "payload_percent": 0.0, "spillage_share": 1.0}
+    assert [get_objective(name).evaluate(Outcome) for name in ("digging_energy", "loading_energy")] == [
+        2.8,
+        2.8,
+    ]
+    assert get_objective("spillage").evaluate(Outcome) == 1.0
+    assert math.isnan(get_objective("breakout").evaluate(Outcome))
+    Outcome.mining = None
+    assert all(math.isnan(item.evaluate(Outcome)) for item in items)
 
 
 def test_a_module_of_ones_own_may_hold_dataclasses_with_postponed_annotations(tmp_path):

@@ -32,7 +32,8 @@ from drakerock.lhd.geometry import BucketGeometry, calc_area, make_bucket_geomet
 from drakerock.lhd.hinge import HingeMoment, add_hinge_moment
 from drakerock.lhd.kinematics import Kinematics, make_kinematics
 from drakerock.lhd.linkage import Linkage
-from drakerock.lhd.model import Machine, add_machine, calc_motor_targets
+from drakerock.lhd.model import Machine, add_machine
+from drakerock.lhd.motors import Motors, add_motors, calc_motor_torques
 
 Array = np.ndarray
 
@@ -65,6 +66,7 @@ class Bench:
     plant: MultibodyPlant
     scene_graph: SceneGraph
     machine: Machine
+    motors: Motors
     kin: Kinematics
     bucket: BucketGeometry
     hinge: HingeMoment
@@ -104,16 +106,27 @@ class Bench:
         """
         plant, machine = self.plant, self.machine
         context, root = self.plant_context, self.context
-        targets = calc_motor_targets(plant, machine, wheel, boom, bucket)
-        plant.get_desired_state_input_port(machine.instance).FixValue(context, targets)
-        hinge_context = self.hinge.GetMyContextFromRoot(root)
+        self.motors.GetInputPort("motor_speeds").FixValue(
+            self.motors.GetMyMutableContextFromRoot(root), np.array([wheel, boom, bucket])
+        )
+        motors_context, hinge_context = (
+            self.motors.GetMyContextFromRoot(root),
+            self.hinge.GetMyContextFromRoot(root),
+        )
         steps = round(duration / plant.time_step())
         start = round(root.get_time() / plant.time_step())
         columns: dict[str, list[object]] = {key: [] for key in Record.__dataclass_fields__}
+        tip = plant.GetFrameByName("tip", machine.instance)
         wall = 0.0
         for k in range(1, steps + 1):
             begin = perf_counter()
             try:
+                # What acts over the step is told at its beginning.
+                net = plant.get_net_actuation_output_port(machine.instance).Eval(context).copy()
+                bias = self.motors.GetOutputPort("bias").Eval(motors_context).copy()
+                columns["moment"].append(self.hinge.GetOutputPort("components").Eval(hinge_context).copy())
+                columns["tyre_force"].append(self._calc_contact_forces(names.WHEELS))
+                columns["bucket_force"].append(self._calc_contact_forces(("bucket",))[0])
                 self.simulator.AdvanceTo((start + k) * plant.time_step())
             except RuntimeError as error:
                 raise SimulationFailure(f"{machine.config.model}: the bench's step failed: {error}") from None
@@ -121,15 +134,25 @@ class Bench:
             columns["time"].append(root.get_time())
             columns["q"].append(plant.GetPositions(context, machine.instance))
             columns["v"].append(plant.GetVelocities(context, machine.instance))
-            columns["effort"].append(plant.get_net_actuation_output_port(machine.instance).Eval(context))
-            columns["moment"].append(self.hinge.GetOutputPort("components").Eval(hinge_context))
+            columns["effort"].append(self._calc_torques(net, bias))
             columns["gap"].append(np.linalg.norm(self.linkage.calc_gap(), axis=1).max(initial=0.0))
-            tip = plant.GetFrameByName("tip", machine.instance)
             columns["tip"].append(tip.CalcPoseInWorld(context).translation())
-            columns["tyre_force"].append(self._calc_contact_forces(names.WHEELS))
-            columns["bucket_force"].append(self._calc_contact_forces(("bucket",))[0])
             columns["wall"].append(wall / k)
         return Record(**{key: np.array(values) for key, values in columns.items()})
+
+    def _calc_torques(self, net: Array, bias: Array) -> Array:
+        """Return the torques (actuators,) over the step that ended, from its net actuation and biases."""
+        joints = [
+            self.plant.get_joint_actuator(k).joint()
+            for k in self.plant.GetJointActuatorIndices(self.machine.instance)
+        ]
+        rates = self.plant.GetVelocities(self.plant_context)[[joint.velocity_start() for joint in joints]]
+        return np.array(
+            [
+                calc_motor_torques(self.machine, joint.name(), net[k], bias[k], rates[k])
+                for k, joint in enumerate(joints)
+            ]
+        )
 
     def get_column(self, joint: str) -> int:
         """Return the column of an actuator in `Record.effort`."""
@@ -159,9 +182,9 @@ class Record:
     """One run, a row per step.
 
     Attributes:
-        time: (n,) [s].
-        q, v: (n, nq), (n, nv) positions and velocities of the machine.
-        effort: (n, actuators) torques [N m], in Drake's order.
+        time: (n,) the step's end [s].
+        q, v: (n, nq), (n, nv) positions and velocities of the machine then.
+        effort: (n, actuators) the motors' torques over the step [N m], in Drake's order.
         moment: (n, 2) the hinge's carried moment [N m].
         gap: (n,) largest closure error of the linkage [m].
         tip: (n, 3) the bucket's tip in the world [m].
@@ -208,7 +231,9 @@ def make_bench(
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(
         MultibodyPlantConfig(
-            time_step=checks.time_step, discrete_contact_approximation=checks.contact_approximation
+            time_step=checks.time_step,
+            discrete_contact_approximation=checks.contact_approximation,
+            use_sampled_output_ports=False,
         ),
         builder,
     )
@@ -242,6 +267,7 @@ def make_bench(
     if not gravity:
         plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
     plant.Finalize()
+    motors = add_motors(builder, plant, machine)
     hinge = add_hinge_moment(builder, plant, machine)
     diagram = builder.Build()
     simulator = Simulator(diagram)
@@ -251,6 +277,7 @@ def make_bench(
         plant=plant,
         scene_graph=scene_graph,
         machine=machine,
+        motors=motors,
         kin=kin or make_kinematics(plant, machine),
         bucket=make_bucket_geometry(plant, scene_graph, machine),
         hinge=hinge,
