@@ -5,6 +5,7 @@ import pydrake.all as drake
 import typer
 
 from drakerock import FeedforwardController, get_pile, load_scenario, make_station, run_cycle
+from drakerock.loading.cycle import save_cycle
 from drakerock.viewing.replay import write_replay
 
 
@@ -32,7 +33,9 @@ def main(out: str = ""):
     station = make_station(scenario, get_pile(scenario), make_controller, visible=False)
     result = run_cycle(scenario, station.rocks.pile, station=station)
     print(f"{result.outcome.bucket_mass_kg:.0f} kg in the bucket at s4")
-    write_replay(result.recording, out) if out else None
+    if out:
+        save_cycle(result, out)
+        write_replay(out)
     return result
 
 

@@ -17,14 +17,8 @@ from drakerock.loading.recording import Recording, Visual, save_recording
 from drakerock.loading.scenario import Scenario
 from drakerock.loading.signal_table import load_signals, save_signals
 from drakerock.rocks.config import SiteConfig
-from drakerock.viewing.cycle_figures import (
-    _find_outlines,
-    calc_rock_poses,
-    draw_height_field,
-    draw_scene,
-    draw_tip_paths,
-    write_cycle_figures,
-)
+from drakerock.viewing.cycle_figures import draw_height_field, draw_tip_paths, write_cycle_figures
+from drakerock.viewing.scene_figures import _find_outlines, calc_rock_poses, draw_scene
 from tests.unit.loading.test_planning import make_wedge, plan_for
 
 COLUMNS = (
