@@ -52,7 +52,11 @@ def digger() -> DiggingMachine:
 
 @pytest.fixture
 def heap() -> PileState:
-    """Twelve rocks in a row of three layers on the floor, apart by a hair."""
+    return make_heap()
+
+
+def make_heap() -> PileState:
+    """Return twelve rocks in a row of three layers on the floor, apart by a hair."""
     rng = np.random.default_rng(3)
     p_WRs = np.array(
         [
