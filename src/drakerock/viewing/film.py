@@ -64,7 +64,8 @@ def write_film(
         raise InputError(f"{path}: .mp4, .gif, or a folder without an ending, for PNG pictures")
     if settings.width % 2 or settings.height % 2:
         raise InputError(f"a film's width and height are even, not {settings.width}x{settings.height}")
-    writer = {"": _Pictures, ".mp4": _Mp4, ".gif": _Gif}[path.suffix](path, settings)
+    writers: dict[str, Callable[[Path, FilmSettings], Any]] = {"": _Pictures, ".mp4": _Mp4, ".gif": _Gif}
+    writer = writers[path.suffix](path, settings)
     with tempfile.TemporaryDirectory() as place:
         page = write_replay(folder, Path(place) / "replay.html")
         try:
@@ -76,7 +77,7 @@ def write_film(
 
 
 async def _film(path: Path, writer: Any, settings: FilmSettings, tell: Callable[[float], None]) -> None:
-    async with open_page(path.with_name(f"{path.name}"), settings.width, settings.height) as page:
+    async with open_page(path, settings.width, settings.height) as page:
         await wait_until_ready(page)
         await page.evaluate(
             "replay.setPlaying(false); document.body.classList.add('film'); "

@@ -182,7 +182,7 @@ def _pack_cycle(cycle: StoredCycle) -> str:
         ],
         "events": [(item["event"], item["time_s"]) for item in cycle.outcome["events"]],
     } | _describe_paths(cycle)
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "times": recording.times,
         "body_start": body_start,
         "body_frame": body_frame,
@@ -197,7 +197,8 @@ def _pack_cycle(cycle: StoredCycle) -> str:
         "track_of_rock": track_of_rock,
         "step_times": s["time"],
         "modes": s["mode"].astype(np.uint8),
-    } | {f"line_{name}": values.astype(np.float32) for h in histories for name, values in h.lines.items()}
+    }
+    arrays |= {f"line_{name}": line.astype(np.float32) for h in histories for name, line in h.lines.items()}
     return pack(values, arrays)
 
 

@@ -40,8 +40,8 @@ def make_results(cycle: StoredCycle) -> list[Result]:
     load = o.get("bucket_mass_kg")
     objectives = o.get("objectives") or {}
 
-    def scale(value: float | None, factor: float) -> float | None:
-        return None if value is None else factor * value
+    def scale(value: float | None, factor: float | None) -> float | None:
+        return None if value is None or factor is None else factor * value
 
     return [
         *(Result(name, name, "", float(value), 2) for name, value in o["strategy"].items()),

@@ -83,6 +83,6 @@ class PoseGrid:
 def join_tracks(tracks: list[Track]) -> tuple[NDArray[np.uint32], NDArray[np.uint16], Array]:
     """Return where each track starts in the joined ones (n + 1,), and their frames (k,) and poses (k, 7)."""
     start = np.cumsum([0, *(len(frames) for frames, _ in tracks)]).astype(np.uint32)
-    frames = np.concatenate([frames for frames, _ in tracks] or [np.zeros(0)]).astype(np.uint16)
-    poses = np.concatenate([poses for _, poses in tracks] or [np.zeros((0, 7))])
+    frames = np.concatenate([np.zeros(0, np.int64), *(frames for frames, _ in tracks)]).astype(np.uint16)
+    poses = np.concatenate([np.zeros((0, 7)), *(poses for _, poses in tracks)])
     return start, frames, poses
