@@ -18,8 +18,14 @@ import numpy as np
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.files import write_text
 from drakerock.identity import calc_config_hash
+from drakerock.loading.cost import LoadingCost
+from drakerock.loading.field import HeightField
+from drakerock.loading.field_file import save_height_fields
+from drakerock.loading.folder import HEIGHT_FIELDS, NEXT_PILE
 from drakerock.loading.outcome import CycleOutcome
+from drakerock.loading.sensing import make_grid
 from drakerock.randomness import make_generator
+from drakerock.rocks.config import SiteConfig
 
 DURATION = float(os.environ.get("STUDY_WORK_SECONDS", "0.05"))
 LOG = os.environ.get("STUDY_WORK_LOG")
@@ -37,8 +43,9 @@ def run(scenario, n_loadings, folder, *, progress=None):
             outcome = CycleOutcome.from_json(path.read_text())
             assert outcome.scenario_hash == calc_config_hash(scenario), "the folder is of another sequence"
         else:
+            if number:
+                state = json.loads((folder / f"loading_{number - 1:02d}" / NEXT_PILE).read_text())
             outcome = _load(scenario, number, state, place, progress)
-        state = json.loads((place / "state.json").read_text())
         outcomes.append(outcome)
         if outcome.status == "failed":
             break
@@ -63,7 +70,7 @@ def _load(scenario, number, state, place, progress):
         if progress:
             progress(number, "s1", 1.0)
     (place / "signals.bin").write_bytes(rng.bytes(int(os.environ.get("STUDY_WORK_BYTES", "2000"))))
-    (place / "state.json").write_text(json.dumps(state))
+    (place / NEXT_PILE).write_text(json.dumps(state))
     failed = MODE == "fail" and s.alpha > 1.5 and number == 1 and scenario.dynamics.time_step > 0.006
     production = 100 * s.alpha + 30 * s.beta + 3 * state
     values = {"production": production, "damage": s.gamma**2 + 0.02 * state, "debris": 500 * s.kappa + state}
@@ -78,9 +85,18 @@ def _load(scenario, number, state, place, progress):
         wall_time_s=started, sim_time_s=9.0, steps=900, ms_per_step=1.0, files={}, seed=scenario.seed,
         versions={}, scenario_hash=calc_config_hash(scenario),
     )  # fmt: skip
+    save_height_fields(*(make_height_field(state + i) for i in (0.0, 0.1)), place / HEIGHT_FIELDS)
+    LoadingCost(1.0, 1.0, 500.0).save(place)
     write_text(place / "outcome.json", outcome.to_json())
     _log(place, "finish")
     return outcome
+
+
+def make_height_field(state):
+    """Return a slope of 45 degrees whose toe is where `state` says."""
+    x, y = make_grid(SiteConfig(drift_width=3.0), 0.5, 4.0)
+    toe = -2.0 - 0.1 * np.tanh(state)
+    return HeightField(x, y, np.maximum(x - toe, 0.0)[:, None] * np.ones(len(y)), 0.5)
 
 
 def _misbehave(scenario, number):

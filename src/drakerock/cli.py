@@ -374,6 +374,43 @@ def study_export(
     _print_paths(export_tables(folder, [format_]))
 
 
+@study_app.command("pack")
+def study_pack(
+    folder: StudyFolder,
+    out: Annotated[Path | None, typer.Option("--out", help="File to write [default: DIR.tar.xz].")] = None,
+    everything: Annotated[
+        bool, typer.Option("--everything", help="Also signals, recordings and piles, where they are kept.")
+    ] = False,
+) -> None:
+    """Pack a study that is not running into one file, to be carried elsewhere and gone on with.
+
+    Example: drakerock study pack out/smoke --out smoke.tar.xz
+    """
+    from drakerock.study.packing import pack_study
+
+    with _show_progress("pack"):
+        path = pack_study(
+            folder, out or folder.with_name(f"{folder.resolve().name}.tar.xz"), everything=everything
+        )
+    _print_paths([path])
+
+
+@study_app.command("unpack")
+def study_unpack(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="What `study pack` wrote.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to; made if missing.")],
+) -> None:
+    """Unpack a packed study, checked; `study run` goes on there.
+
+    Example: drakerock study unpack smoke.tar.xz out/smoke
+    """
+    from drakerock.study.packing import unpack_study
+
+    with _show_progress("unpack"):
+        unpack_study(path, folder)
+    _print_paths([folder])
+
+
 @study_app.command("verify")
 def study_verify(folder: StudyFolder, json_: JsonOption = False) -> None:
     """Check the store: database, checksums, missing files, files that belong to nothing.

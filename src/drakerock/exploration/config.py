@@ -34,6 +34,12 @@ class SamplingConfig(Config):
     n_samples: int = Field(default=204, ge=1, description="sample points in all, initial design included")
     n_validation: int = Field(default=40, ge=0, description="random points used for validation only")
     batch_size: int = Field(default=8, ge=1, description="points per sequential step")
+    lag: int | None = Field(
+        default=None,
+        ge=0,
+        description="a sequential step waits for all points but the last so many asked for, whose responses it does "
+        "without, so that workers have work at the end of a step; none: batch_size; 0: it waits for all",
+    )
     methods: tuple[MethodName, ...] = Field(
         default=("lola_voronoi", "error"),
         min_length=1,
@@ -41,6 +47,11 @@ class SamplingConfig(Config):
     )
     n_candidates: int = Field(default=2048, ge=64, description="candidate points of the sequential methods")
     surrogate: SurrogateConfig = SurrogateConfig()
+
+    def count_awaited(self, n: int) -> int:
+        """Return how many of `n` points asked for, the first ones, a sequential step waits for; at least half."""
+        lag = self.batch_size if self.lag is None else self.lag
+        return n - min(lag, n // 2)
 
 
 class Bound(Config):

@@ -16,6 +16,8 @@ from drakerock.errors import SimulationFailure
 from drakerock.files import make_folder, write_text
 from drakerock.loading.evaluation import make_outcome
 from drakerock.loading.field import HeightField
+from drakerock.loading.field_file import save_height_fields
+from drakerock.loading.folder import HEIGHT_FIELDS
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.performance import Weighing, find_bucket_load, find_debris, find_lost
 from drakerock.loading.plan import DigPlan, NoPlan
@@ -23,6 +25,7 @@ from drakerock.loading.plan_file import save_plan
 from drakerock.loading.recording import Recorder, Recording, save_recording
 from drakerock.loading.scenario import Scenario
 from drakerock.loading.segments import Mode
+from drakerock.loading.sensing import look_down
 from drakerock.loading.signal_table import save_signals
 from drakerock.loading.signals import calc_signals
 from drakerock.loading.station import Station, make_station
@@ -45,6 +48,7 @@ class CycleResult:
         in_bucket: (n,) rocks that the bucket took: in it at t4, or still at the end.
         debris: (n,) rocks left loose on the floor.
         field: the sensed height field.
+        field_after: heights when the rocks rest again, the load taken out, on the same grid; None after a failure.
         plan: what was planned.
         signals, units: columns (k,) of all steps, and their units.
         recording: for the replay; None if nothing ran.
@@ -57,6 +61,7 @@ class CycleResult:
     in_bucket: NDArray[np.bool_]
     debris: NDArray[np.bool_]
     field: HeightField
+    field_after: HeightField | None
     plan: DigPlan | NoPlan
     signals: dict[str, Array]
     units: dict[str, str]
@@ -121,8 +126,11 @@ def run_cycle(
         cpu_time=clock.process_time() - start[1],
     )
     return CycleResult(
-        outcome, scenario, pile, pile_after, in_bucket, debris, field, cycle.plan, signals, units,
-        cycle.recorder.finish(_make_notes(outcome)),
+        outcome, scenario, pile, pile_after, in_bucket, debris, field,
+        None if failure else look_down(
+            pile_after.select(~in_bucket), station.shapes, scenario.site, field.x, field.y, field.cell
+        ),
+        cycle.plan, signals, units, cycle.recorder.finish(_make_notes(outcome)),
     )  # fmt: skip
 
 
@@ -264,7 +272,7 @@ def _make_notes(outcome: CycleOutcome) -> dict[str, object]:
 
 def save_cycle(result: CycleResult, folder: str | Path) -> list[Path]:
     """Write a cycle's files: outcome.json, signals.parquet, plan.json, scenario.json, pile_before.npz,
-    pile_after.npz, recording.npz.
+    pile_after.npz, recording.npz, height_fields.npz.
 
     Returns:
         The paths written; outcome.json is the last, so that a folder with it is complete.
@@ -280,6 +288,8 @@ def save_cycle(result: CycleResult, folder: str | Path) -> list[Path]:
     if result.recording is not None:
         save_recording(result.recording, folder / "recording.npz")
     save_plan(result.plan, result.field, folder / "plan.json")
+    if result.field_after is not None:
+        save_height_fields(result.field, result.field_after, folder / HEIGHT_FIELDS)
     write_text(folder / "scenario.json", result.scenario.model_dump_json(indent=2) + "\n")
     write_text(folder / "outcome.json", result.outcome.to_json())
     names = [
@@ -288,6 +298,7 @@ def save_cycle(result: CycleResult, folder: str | Path) -> list[Path]:
         "signals.parquet",
         "recording.npz",
         "plan.json",
+        HEIGHT_FIELDS,
         "scenario.json",
         "outcome.json",
     ]

@@ -49,7 +49,13 @@ def calc_height_field(
         cell: grid spacing [m].
         length: how much of the drift is seen, back from the brow [m].
     """
-    x, y = make_grid(site, cell, length)
+    return look_down(pile, shapes, site, *make_grid(site, cell, length), cell)
+
+
+def look_down(
+    pile: PileState, shapes: tuple[RockShape, ...], site: SiteConfig, x: Array, y: Array, cell: float
+) -> HeightField:
+    """Return the ideal height field on a grid of one's own; arguments as of `calc_height_field`, cell centres x, y."""
     grid_x, grid_y = np.meshgrid(x, y, indexing="ij")
     roof = np.broadcast_to(calc_roof_height(site, grid_y), grid_x.shape)
     origins = np.column_stack([grid_x.ravel(), grid_y.ravel(), roof.ravel()])

@@ -10,7 +10,9 @@ import numpy as np
 from drakerock.errors import InputError, SimulationFailure
 from drakerock.files import make_folder
 from drakerock.identity import calc_config_hash, get_versions
+from drakerock.loading.cost import Meter
 from drakerock.loading.cycle import CycleResult, run_cycle, save_cycle
+from drakerock.loading.folder import NEXT_PILE, OUTCOME
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.memory import free_diagrams
@@ -22,8 +24,6 @@ from drakerock.rocks.state import PileState, load_pile, save_pile
 
 SequenceProgress = Callable[[int, str, float], None]
 """Called with the loading's number, what is being done, and the simulated time [s]."""
-
-NEXT_PILE = "pile_next.npz"
 
 
 def run_sequence(
@@ -56,15 +56,16 @@ def run_sequence(
         SimulationFailure: the pile could not be made or refilled.
     """
     make_folder(folder)
-    pile, _ = fetch_pile(make_recipe(scenario))
     identity = calc_config_hash(scenario)
-    outcomes = []
+    outcomes: list[CycleOutcome] = []
+    pile: PileState | None = None
     for number in range(n_loadings):
         place = folder / f"loading_{number:02d}"
-        done = _read_loading(place, identity)
-        if done is None:
-            done = _run_loading(scenario, pile, number, place, progress)
-        outcome, pile = done
+        outcome = _read_loading(place, identity)
+        if outcome is None:
+            if pile is None:
+                pile = _read_pile(scenario, folder, number)
+            outcome, pile = _run_loading(scenario, pile, number, place, progress)
         outcomes.append(outcome)
         if finished:
             finished(place)
@@ -73,8 +74,15 @@ def run_sequence(
     return outcomes
 
 
-def _read_loading(place: Path, identity: str) -> tuple[CycleOutcome, PileState] | None:
-    path = place / "outcome.json"
+def _read_pile(scenario: Scenario, folder: Path, number: int) -> PileState:
+    """Return the pile that a loading starts from."""
+    if number == 0:
+        return fetch_pile(make_recipe(scenario))[0]
+    return load_pile(folder / f"loading_{number - 1:02d}" / NEXT_PILE)
+
+
+def _read_loading(place: Path, identity: str) -> CycleOutcome | None:
+    path = place / OUTCOME
     if not path.exists():
         return None
     try:
@@ -92,7 +100,7 @@ def _read_loading(place: Path, identity: str) -> tuple[CycleOutcome, PileState] 
             f"{path}: made by other versions ({_show(outcome.versions)}, not {_show(get_versions())}); take another "
             "folder"
         )
-    return outcome, load_pile(place / NEXT_PILE)
+    return outcome
 
 
 def _show(versions: dict[str, str]) -> str:
@@ -106,12 +114,14 @@ def _run_loading(
         if progress:
             progress(number, stage, time)
 
+    meter = Meter()
     result = run_cycle(scenario, pile, lambda mode, time: tell(mode.lower(), time))
     free_diagrams()
     tell("refill", result.outcome.sim_time_s)
     following = make_next_pile(scenario, result, number)
     make_folder(place)
     save_pile(following, place / NEXT_PILE)
+    meter.read().save(place)
     save_cycle(result, place)
     return result.outcome, following
 

@@ -25,7 +25,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import IO, Any, Self
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -34,6 +34,8 @@ from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.problem import Array
 from drakerock.files import make_folder, read_json, write_text
 from drakerock.identity import RESULTS_REVISION, calc_config_hash, describe_content, get_versions
+from drakerock.loading.cost import LoadingCost
+from drakerock.loading.folder import HEIGHT_FIELDS, OUTCOME, PLAN
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario
 from drakerock.study.schema import StudyConfig
@@ -41,7 +43,7 @@ from drakerock.study.schema import StudyConfig
 DATABASE = "study.db"
 STUDY = "study.json"
 POINTS = "points"
-_SCHEMA_VERSION = 2
+_SCHEMA_VERSION = 3
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS points (
@@ -54,6 +56,7 @@ CREATE TABLE IF NOT EXISTS sequences (
 CREATE TABLE IF NOT EXISTS cycles (
     point TEXT NOT NULL, attempt INTEGER NOT NULL, loading INTEGER NOT NULL, status TEXT NOT NULL,
     reason TEXT NOT NULL, outcome TEXT NOT NULL, files TEXT NOT NULL, seconds REAL, recorded REAL NOT NULL,
+    cpu_seconds REAL, memory_MB REAL,
     PRIMARY KEY (point, attempt, loading), FOREIGN KEY (point, attempt) REFERENCES sequences);
 CREATE TABLE IF NOT EXISTS runs (
     run INTEGER PRIMARY KEY, started REAL NOT NULL, ended REAL, host TEXT NOT NULL, process INTEGER NOT NULL,
@@ -62,7 +65,7 @@ CREATE TABLE IF NOT EXISTS events (time REAL NOT NULL, kind TEXT NOT NULL, text 
 """
 # Checks the types of what an outcome.json holds.
 _OUTCOME = TypeAdapter(CycleOutcome)
-_KEPT_OF_OUTCOMES = ("outcome.json", "plan.json")
+KEPT_OF_OUTCOMES = (OUTCOME, PLAN, HEIGHT_FIELDS)
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,9 @@ class Store:
         db: the connection; to be written within `transaction` only.
     """
 
-    def __init__(self, folder: Path, study: StudyConfig, db: sqlite3.Connection, lock: Any = None) -> None:
+    def __init__(
+        self, folder: Path, study: StudyConfig, db: sqlite3.Connection, lock: IO[str] | None = None
+    ) -> None:
         self.folder = folder
         self.study = study
         self.db = db
@@ -115,12 +120,7 @@ class Store:
         """
         folder = Path(folder)
         make_folder(folder)
-        lock = open(folder / ".lock", "a")  # noqa: SIM115 - held as long as the store is
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.close()
-            raise InputError(f"{folder}: another process is running this study") from None
+        lock = _lock(folder)
         try:
             if (folder / POINTS).exists() and not (folder / DATABASE).exists():
                 raise InputError(
@@ -194,6 +194,23 @@ class Store:
         except sqlite3.OperationalError as error:
             raise RunStopped(f"{self.folder / DATABASE}: {error}") from None
 
+    @contextmanager
+    def hold(self) -> Iterator[None]:
+        """Keep others from running an opened study, and record what a killed run has finished and not recorded.
+
+        Raises:
+            InputError: another process is running it.
+        """
+        self._lock = _lock(self.folder)
+        try:
+            for point in self.list_points():
+                if point.attempt_status == "running":
+                    self.record_cycles(point.name, point.attempt, point.n_recorded, None)
+            yield
+        finally:
+            self._lock.close()
+            self._lock = None
+
     # Points and sequences
 
     def add_points(self, role: str, batch: int, X: Array) -> None:
@@ -263,23 +280,24 @@ class Store:
         places: dict[int, Path] = {}
         for loading in range(n_recorded, self.study.loadings):
             place = folder / f"loading_{loading:02d}"
-            if not (place / "outcome.json").exists():
+            if not (place / OUTCOME).exists():
                 break
             places[loading] = place
         if not places:
             return n_recorded
         rows = []
         for loading, place in places.items():
-            outcome = read_outcome(place / "outcome.json")
+            outcome = read_outcome(place / OUTCOME)
             files = calc_checksums(place, self.study.storage.keep)
             share = None if seconds is None else seconds / len(places)
+            cost = LoadingCost.read(place)
             text = json.dumps(json.loads(outcome.to_json()))
             rows.append(
                 (point, attempt, loading, outcome.status, outcome.reason if outcome.status == "failed" else "",
-                 text, json.dumps(files), share, time.time())
+                 text, json.dumps(files), share, time.time(), cost and cost.cpu_time_s, cost and cost.memory_MB)
             )  # fmt: skip
         with self.transaction() as db:
-            db.executemany("INSERT OR REPLACE INTO cycles VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
+            db.executemany("INSERT OR REPLACE INTO cycles VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
         return n_recorded + len(rows)
 
     def finish_sequence(
@@ -400,13 +418,24 @@ def calc_checksums(folder: Path, keep: str) -> dict[str, str]:
     """Return the SHA-256 of each file of a cycle that stays, by its path relative to the cycle's folder."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     if keep == "outcomes":
-        files = [path for path in files if path.name in _KEPT_OF_OUTCOMES]
+        files = [path for path in files if path.name in KEPT_OF_OUTCOMES]
     return {path.relative_to(folder).as_posix(): hash_file(path) for path in files}
 
 
 def calc_inputs_hash(scenario: Scenario, n_loadings: int) -> str:
     """Return the hash of all that a sequence's outcomes depend on: scenario, seed, loadings, versions."""
     return calc_config_hash(scenario, str(n_loadings), *get_versions().values())
+
+
+def _lock(folder: Path) -> IO[str]:
+    """Return the file whose lock says that this process writes the store; InputError if another one does."""
+    lock = open(folder / ".lock", "a")  # noqa: SIM115 - held as long as the store is
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        raise InputError(f"{folder}: another process is running this study") from None
+    return lock
 
 
 def _connect(path: Path, make: bool = True) -> sqlite3.Connection:

@@ -89,10 +89,7 @@ def make_status_table(status: dict[str, Any]) -> Table:
     for item in status["sequences_running"][:16]:
         attempt = f", attempt {item['attempt'] + 1}" if item["attempt"] else ""
         table.add_row("running", f"{item['point']}{attempt}: {item['cycles']} cycles done")
-    if status["awake_rocks_mean"] is not None:
-        table.add_row("awake rocks", f"{status['awake_rocks_mean']:.0f} on average")
-    if status["seconds_per_cycle"] is not None:
-        table.add_row("time per cycle", f"{status['seconds_per_cycle']:.3g} s")
+    _add_cost_rows(table, status)
     if status["eta_s"] is not None and not status["complete"]:
         workers = f" with {run['workers']} workers" if run else ""
         table.add_row("ETA", format_duration(status["eta_s"]) + workers)
@@ -109,6 +106,22 @@ def make_status_table(status: dict[str, Any]) -> Table:
     if len(status["versions"]) > 1:
         table.add_row("versions", f"results of {len(status['versions'])} different versions")
     return table
+
+
+def _add_cost_rows(table: Table, status: dict[str, Any]) -> None:
+    if status["awake_rocks_mean"] is not None:
+        table.add_row("awake rocks", f"{status['awake_rocks_mean']:.0f} on average")
+    if status["seconds_per_cycle"] is not None:
+        table.add_row("time per cycle", f"{status['seconds_per_cycle']:.3g} s")
+    if status["loadings_per_hour"] is not None:
+        table.add_row("speed", f"{status['loadings_per_hour']:.3g} loadings per hour")
+    if status["cpu_hours_used"] is not None:
+        table.add_row(
+            "CPU hours",
+            f"{status['cpu_hours_used']:.3g} used, about {status['cpu_hours_left'] or 0.0:.3g} left",
+        )
+    if status["worker_memory_max_MB"] is not None:
+        table.add_row("memory", f"{status['worker_memory_max_MB']:.0f} MB at most in a worker")
 
 
 def format_duration(seconds: float) -> str:

@@ -1,8 +1,9 @@
 """Running a study: the sampler asks, the executor runs, the store records.
 
-The unit of work is a sequence at a point. The points of a sampling step are asked for once all points of the
-steps before have ended, so that they depend on responses only, not on workers or on who finished first.
-Validation points, which depend on nothing, fill the gaps at the ends of the steps.
+The unit of work is a sequence at a point. The points of a sampling step are asked for once all points asked for
+before have ended, but for the last few (`SamplingConfig.lag`), whose responses are left out even if they are there. So
+they depend on responses only, not on workers or on who finished first, and workers need not wait for the slowest.
+Validation points, which depend on nothing, fill what gaps there are.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from contextlib import contextmanager
 from math import floor
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.problem import Array
@@ -172,20 +175,27 @@ class _Runner:
             store.add_points("validation", 0, X[len(validation) :])
             validation = store.list_points("validation")
         samples = store.list_points("sample")
-        if len(samples) < config.n_samples and all(p.status in ("done", "failed") for p in samples):
-            store.add_points("sample", _next_batch(samples), self._ask(len(samples)))
+        while len(samples) < config.n_samples:
+            awaited = samples[: config.count_awaited(len(samples))]
+            if not all(point.status in ("done", "failed") for point in awaited):
+                break
+            store.add_points("sample", _next_batch(samples), self._ask(samples, {p.name for p in awaited}))
             samples = store.list_points("sample")
         # A study resumed with fewer points leaves the rest be.
         wanted = samples[: config.n_samples] + validation[: config.n_validation]
         return [point for point in wanted if point.status not in ("done", "failed")]
 
-    def _ask(self, n_samples: int) -> Array:
-        config = self._study.exploration.sampling
+    def _ask(self, samples: list[Point], awaited: set[str]) -> Array:
+        """Return the points of the next step, from the responses of the points `awaited` and the places of all."""
+        config, n_samples = self._study.exploration.sampling, len(samples)
         sampler = make_sampler(self._study.problem, config, self._study.seed)
         if n_samples == 0:
             return sampler.ask(min(len(sampler.initial), config.n_samples))
+        X = np.array([point.x for point in samples])
+        sampler.tell(X, np.full((n_samples, len(self._study.problem.objectives)), np.nan))
         table = read_responses(self._store, "sample")
-        sampler.tell(table.X, table.Y, table.noise)
+        told = np.isin(table.point, sorted(awaited))
+        sampler.tell(table.X[told], table.Y[told], table.noise[told])
         # Of an initial design cut short by an earlier, smaller number of points, the rest comes first.
         left = len(sampler.initial) - n_samples
         return sampler.ask(min(left if left > 0 else config.batch_size, config.n_samples - n_samples))

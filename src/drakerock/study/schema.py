@@ -128,7 +128,9 @@ class StorageConfig(Config):
 
     keep: Annotated[
         Literal["everything", "outcomes"],
-        Field(description="all files of each cycle (piles, signals, recording), or outcome and plan only"),
+        Field(
+            description="all files of each cycle (piles, signals, recording), or outcome, plan and height fields only"
+        ),
     ] = "everything"
 
 

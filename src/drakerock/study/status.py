@@ -23,10 +23,11 @@ def read_status(store: Store) -> dict[str, Any]:
         "c.attempt = (SELECT MAX(attempt) FROM sequences s WHERE s.point = c.point)"
     ).fetchone()
     recent = db.execute(
-        "SELECT AVG(seconds), AVG(awake) FROM (SELECT seconds, "
+        "SELECT AVG(seconds), AVG(awake), AVG(cpu_seconds) FROM (SELECT seconds, cpu_seconds, "
         "json_extract(outcome, '$.rocks.awake_mean') AS awake FROM cycles "
         "WHERE seconds IS NOT NULL ORDER BY recorded DESC LIMIT 100)"
     ).fetchone()
+    cpu_used, memory = db.execute("SELECT SUM(cpu_seconds), MAX(memory_MB) FROM cycles").fetchone()
     run = db.execute(
         "SELECT run, started, ended, host, process, executor, workers, ending FROM runs ORDER BY run DESC"
     ).fetchone()
@@ -65,6 +66,11 @@ def read_status(store: Store) -> dict[str, Any]:
         ],
         "worker_deaths": db.execute("SELECT COUNT(*) FROM events WHERE kind = 'worker lost'").fetchone()[0],
         "seconds_per_cycle": seconds,
+        "cpu_seconds_per_cycle": recent[2],
+        "loadings_per_hour": 3600.0 * workers / seconds if seconds and workers else None,
+        "cpu_hours_used": None if cpu_used is None else cpu_used / 3600.0,
+        "cpu_hours_left": None if recent[2] is None else max(rest, 0) * recent[2] / 3600.0,
+        "worker_memory_max_MB": memory,
         "awake_rocks_mean": recent[1],
         "eta_s": max(rest, 0) * seconds / workers if seconds is not None and workers else None,
         "last_run": dict(zip(names, run, strict=True)) if run else None,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,6 +16,7 @@ import pyarrow.parquet
 from drakerock.errors import InputError
 from drakerock.exploration.problem import Array
 from drakerock.exploration.table import ResponseTable, average_loadings
+from drakerock.loading.folder import HEIGHT_FIELDS
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.study.db import STUDY, Store
 from drakerock.study.objectives import get_objective
@@ -87,11 +90,11 @@ def read_loadings(store: Store) -> pa.Table:
     problem, columns = store.study.problem, {}
     points = {point.name: point for point in store.list_points()}
     rows = store.db.execute(
-        "SELECT c.point, c.attempt, c.loading, c.status, c.reason, c.outcome, c.seconds, s.inputs_hash "
+        "SELECT c.point, c.attempt, c.loading, c.status, c.reason, c.outcome, c.seconds, c.cpu_seconds, s.inputs_hash "
         "FROM cycles c JOIN sequences s ON s.point = c.point AND s.attempt = c.attempt "
         "JOIN points p ON p.point = c.point ORDER BY p.role, c.point, c.attempt, c.loading"
     ).fetchall()
-    outcomes = [json.loads(row[5]) for row in rows]
+    outcomes = [_flatten(json.loads(row[5])) for row in rows]
     columns["point"] = [row[0] for row in rows]
     columns["role"] = [points[row[0]].role for row in rows]
     for j, name in enumerate(("attempt", "loading", "status", "reason"), start=1):
@@ -103,39 +106,91 @@ def read_loadings(store: Store) -> pa.Table:
             np.nan if row[3] == "failed" else item.evaluate(CycleOutcome.from_json(row[5])) for row in rows
         ]
         columns[item.objective.name] = pa.array(values, pa.float64(), from_pandas=True)
-    for name in ("bucket_mass_kg", "bucket_rocks", "weighed_mass_kg", "loading_time_s", "energy_J",
-                 "peak_push_force_N", "mean_push_force_N", "sim_time_s", "steps", "seed",
-                 "scenario_hash", "wall_time_s"):  # fmt: skip
-        columns[name] = [outcome[name] for outcome in outcomes]
-    for name in ("total", "awake_mean", "awake_max"):
-        columns[f"rocks_{name}"] = [outcome["rocks"].get(name) for outcome in outcomes]
-    columns["seconds"] = [row[6] for row in rows]
-    columns["inputs_hash"] = [row[7] for row in rows]
+    for name in dict.fromkeys(name for outcome in outcomes for name in outcome if name not in columns):
+        columns[name] = [outcome.get(name) for outcome in outcomes]
+    for j, name in enumerate(("seconds", "cpu_seconds", "inputs_hash"), start=6):
+        columns[name] = [row[j] for row in rows]
     return pa.table(columns)
+
+
+def _flatten(outcome: dict[str, Any]) -> dict[str, Any]:
+    """Return the numbers and words of an outcome, those in groups as ``group_name``; lists are left out."""
+    flat: dict[str, Any] = {}
+    for name, value in outcome.items():
+        if name in ("objectives", "phi1", "phi2", "phi3", "strategy", "files", "versions"):
+            continue  # in columns of their own, or the same for all
+        items = (
+            {f"{name}_{key}": item for key, item in value.items()}
+            if isinstance(value, dict)
+            else {name: value}
+        )
+        flat |= {key: item for key, item in items.items() if not isinstance(item, dict | list)}
+    return flat
+
+
+def read_height_fields(store: Store) -> pa.Table:
+    """Return one row per loading that has height fields: what was sensed before it, what lay after it.
+
+    Columns: point, attempt, loading; ``h_before``, ``h_after``: heights [m] as lists, row by row of the grid (nx, ny);
+    ``nx``, ``ny``, ``cell`` [m]; the features of the pile before (`PileFeatures`). Cell (i, j) is centred at x =
+    -cell (nx - 1 - i + 0.5), y = cell (j - (ny - 1) / 2) where the sensor is one of ours.
+
+    Raises:
+        InputError: a file that cannot be read.
+    """
+    from drakerock.loading.features import calc_pile_features
+    from drakerock.loading.field_file import load_height_fields
+
+    front_height = store.study.scenario.loading.sensing.front_height
+    rows: list[dict[str, Any]] = []
+    for point, attempt, loading in store.db.execute(
+        "SELECT point, attempt, loading FROM cycles ORDER BY point, attempt, loading"
+    ).fetchall():
+        path = store.find_sequence_folder(point, attempt) / f"loading_{loading:02d}" / HEIGHT_FIELDS
+        if not path.exists():
+            continue
+        before, after = load_height_fields(path)
+        nx, ny = before.h.shape
+        rows.append(
+            {"point": point, "attempt": attempt, "loading": loading, "nx": nx, "ny": ny, "cell": before.cell}
+            | asdict(calc_pile_features(before, front_height))
+            | {
+                f"h_{name}": np.float32(field.h).ravel()
+                for name, field in (("before", before), ("after", after))
+            }
+        )
+    return pa.Table.from_pylist(rows)
 
 
 def export_tables(folder: str | Path, formats: Sequence[str] = ("csv", "parquet")) -> list[Path]:
     """Write `responses` (a row per finished point) and `loadings` (a row per cycle); return the paths.
 
+    As Parquet also `height_fields` (a row per loading that has them).
+
     Raises:
         InputError: no store there; not one of the formats csv and parquet; the folder cannot be written.
     """
     with Store.open(folder) as store:
-        responses, loadings = read_responses(store), read_loadings(store)
+        responses = read_responses(store)
+        tables = {"loadings": read_loadings(store)}
+        if "parquet" in formats:
+            tables["height_fields"] = read_height_fields(store)
     paths = []
     for suffix in formats:
         if suffix not in ("csv", "parquet"):
             raise InputError(f"format {suffix}: csv or parquet")
-        for name in ("responses", "loadings"):
+        for name in ("responses", "loadings", "height_fields"):
+            if name == "height_fields" and (suffix == "csv" or not len(tables[name])):
+                continue
             path = Path(folder) / f"{name}.{suffix}"
             partial = path.with_name(f".partial-{path.name}")
             try:
                 if name == "responses":
                     responses.save(partial)
                 elif suffix == "csv":
-                    pyarrow.csv.write_csv(loadings, partial)
+                    pyarrow.csv.write_csv(tables[name], partial)
                 else:
-                    pyarrow.parquet.write_table(loadings, partial)
+                    pyarrow.parquet.write_table(tables[name], partial, compression="zstd")
                 partial.replace(path)
             except OSError as error:
                 raise InputError(f"{path}: cannot be written: {error}") from None

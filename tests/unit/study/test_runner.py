@@ -12,11 +12,12 @@ import study_work
 from drakerock.config import parse_config
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.table import ResponseTable
+from drakerock.loading.field_file import load_height_fields
 from drakerock.study import db
 from drakerock.study.db import Store
 from drakerock.study.executors import make_slurm_cluster
 from drakerock.study.resimulation import Resimulation
-from drakerock.study.runner import run_study
+from drakerock.study.runner import _Runner, run_study
 from drakerock.study.schema import SlurmConfig, StudyConfig
 from drakerock.study.status import read_status
 from drakerock.study.tables import export_tables
@@ -88,6 +89,52 @@ def test_the_table_is_the_means_of_the_outcomes(finished):
     loadings = pq.read_table(finished / "loadings.parquet")
     assert loadings.num_rows == 76
     assert len(set(loadings["inputs_hash"].to_pylist())) == 19
+    assert {"bucket_mass_kg", "rocks_awake_mean", "cpu_seconds"} <= set(loadings.column_names)
+
+
+def test_the_height_fields_of_every_loading_are_a_table(finished):
+    table = pq.read_table(finished / "height_fields.parquet")
+    assert table.num_rows == 76
+    row = table.slice(30, 1).to_pylist()[0]
+    before, after = load_height_fields(
+        finished / f"points/{row['point']}/attempt_0/loading_{row['loading']:02d}/height_fields.npz"
+    )
+    assert np.allclose(np.reshape(row["h_before"], (row["nx"], row["ny"])), before.h)
+    assert np.allclose(np.reshape(row["h_after"], (row["nx"], row["ny"])), after.h)
+    assert row["front_mean_m"] < -1.0
+
+
+def test_costs_are_in_the_status(finished):
+    with Store.open(finished) as store:
+        status = read_status(store)
+    # The stand-in says that each loading took a second.
+    assert status["cpu_hours_used"] == pytest.approx(76 / 3600)
+    assert status["cpu_hours_left"] == 0.0
+    assert status["worker_memory_max_MB"] == 500.0
+    assert status["loadings_per_hour"] > 0.0
+
+
+def test_a_step_does_not_wait_for_the_last_points_and_does_without_their_responses(tmp_path):
+    """Whether they have ended or not: the points asked for are the same."""
+    study = make_study("exploration.sampling.n_validation=0", "loadings=1")
+    run_study(study, tmp_path / "whole", work=WORK)
+    with Store.open(tmp_path / "whole") as store:
+        whole = [point.x for point in store.list_points()]
+        batches = [point.batch for point in store.list_points()]
+    assert batches == 10 * [0] + 3 * [1] + 3 * [2]
+    for n_ended in (7, 8, 9):
+        with Store.create(tmp_path / f"part{n_ended}", study) as store:
+            store.add_points("sample", 0, np.array(whole[:10]))
+            for number in range(n_ended):
+                name = f"s{number + 1:04d}"
+                store.begin_sequence(name, 0, study.make_scenario(whole[number]))
+                place = store.find_sequence_folder(name, 0)
+                study_work.run(study.make_scenario(whole[number]), 1, place)
+                store.record_cycles(name, 0, 0, None)
+                store.finish_sequence(name, 0, "done")
+            asked = _Runner(store, None, WORK)._plan()
+        assert [point.name for point in asked] == [f"s{n:04d}" for n in range(n_ended + 1, 14)]
+        assert np.array_equal([point.x for point in asked[-3:]], whole[10:13])
 
 
 def test_running_again_changes_nothing(copy):
@@ -200,7 +247,7 @@ def test_keeping_outcomes_only(tmp_path):
     with Store.open(tmp_path / "store") as store:
         assert verify_store(store) == []
     names = {path.name for path in (tmp_path / "store/points").rglob("*") if path.is_file()}
-    assert names <= {"outcome.json", "attempt_0.lock"}
+    assert names <= {"outcome.json", "height_fields.npz", "attempt_0.lock"}
 
 
 def test_failures_are_retried_with_another_seed_and_step(tmp_path, behave):
