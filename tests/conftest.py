@@ -16,6 +16,7 @@ from drakerock.lhd.config import MachineConfig
 from drakerock.lhd.geometry import make_bucket_geometry
 from drakerock.lhd.kinematics import make_kinematics
 from drakerock.lhd.model import add_machine
+from drakerock.loading.plan import DigPlan
 from drakerock.loading.planning import DiggingMachine
 from drakerock.loading.scenario import Scenario
 from drakerock.rocks.config import RocksConfig
@@ -48,6 +49,14 @@ def digger() -> DiggingMachine:
     return DiggingMachine(
         make_kinematics(plant, machine), make_bucket_geometry(plant, scene_graph, machine), 3.1
     )
+
+
+@pytest.fixture(scope="session")
+def plan(digger: DiggingMachine) -> DigPlan:
+    """A plan for an even slope."""
+    from tests.unit.loading.test_planning import make_wedge, plan_for
+
+    return plan_for(digger, make_wedge(), beta=0.6, kappa=0.6)
 
 
 @pytest.fixture

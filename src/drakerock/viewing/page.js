@@ -427,7 +427,7 @@ class Chart {
     for (const [label, key, factor, digits] of shares) {
       const field = document.createElement("span");
       field.innerHTML = key === "fill_factor" ? `<span></span> <b></b>` : `<b></b> <span></span>`;
-      field.querySelector("span").textContent = place + label;
+      field.querySelector("span").textContent = (place ? `${"AB"[r]} ` : "") + label;
       const value = field.querySelector("b");
       value.dataset.value = place + key;
       this.fields.push([value, run, "load", factor, digits]);
@@ -474,6 +474,8 @@ class Replay {
     for (const [r, run] of this.runs.entries()) {
       const row = document.createElement("div");
       row.className = "ticks";
+      area.before(row);
+      const gap = 20 / Math.max(row.clientWidth, 200); // as wide as a name
       let last = -1;
       for (const [name, time] of run.ticks) {
         const share = time / this.duration;
@@ -482,8 +484,8 @@ class Replay {
         tick.title = `${name} at ${time.toFixed(2)} s`;
         tick.dataset.time = time;
         // Waypoints close in time stand beside each other.
-        tick.style.left = `${100 * Math.max(share, last + 0.025)}%`;
-        last = Math.max(share, last + 0.025);
+        tick.style.left = `${100 * Math.max(share, last + gap)}%`;
+        last = Math.max(share, last + gap);
         row.append(tick);
       }
       for (const [name, time] of run.events) {
@@ -493,7 +495,6 @@ class Replay {
         mark.style.left = `${(100 * time) / this.duration}%`;
         row.append(mark);
       }
-      area.before(row);
     }
     area.addEventListener("input", () => { this.setPlaying(false); this.seek(Number(area.value)); });
   }

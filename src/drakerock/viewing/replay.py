@@ -184,11 +184,11 @@ def _pack_cycle(cycle: StoredCycle) -> str:
     } | _describe_paths(cycle)
     arrays: dict[str, NDArray[Any]] = {
         "times": recording.times,
-        "body_start": body_start,
-        "body_frame": body_frame,
+        "body_start": body_start.astype(np.uint32),
+        "body_frame": body_frame.astype(np.uint16),
         "body_pose": grid.round(body_pose),
-        "rock_start": rock_start,
-        "rock_frame": rock_frame,
+        "rock_start": rock_start.astype(np.uint32),
+        "rock_frame": rock_frame.astype(np.uint16),
         "rock_pose": grid.round(rock_pose),
         "rock_rest": grid.round(recording.X_WRs),
         "rock_shape": recording.rock_shape.astype(np.uint16),

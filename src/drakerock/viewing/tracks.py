@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drakerock.loading.recording import Recording
-from drakerock.viewing.keyframes import calc_distances, thin_keyframes
+from drakerock.viewing.keyframes import calc_distances, thin_keyframes, thin_tracks
 
 Array = NDArray[np.float64]
 Track = tuple[NDArray[np.int64], Array]
@@ -40,9 +40,10 @@ def make_rock_tracks(recording: Recording) -> dict[int, Track]:
     """Return the track of each rock that moves, by its number."""
     radii = np.array([np.linalg.norm(vertices, axis=1).max() for vertices, _ in recording.rock_shapes])
     order = np.argsort(recording.move_rock, kind="stable")
-    rocks, starts = np.unique(recording.move_rock[order], return_index=True)
-    tracks = {}
-    for rock, rows in zip(rocks.tolist(), np.split(order, starts)[1:], strict=True):
+    rocks, begins = np.unique(recording.move_rock[order], return_index=True)
+    full: dict[int, Track] = {}
+    reach: dict[int, float] = {}
+    for rock, rows in zip(rocks.tolist(), np.split(order, begins)[1:], strict=True):
         moved = recording.move_frame[rows].astype(np.int64)
         moved_poses = recording.move_pose[rows].astype(float)
         # A rock is recorded in the frames in which it moved: in others it stays where it was.
@@ -50,11 +51,16 @@ def make_rock_tracks(recording: Recording) -> dict[int, Track]:
         before = np.vstack([recording.X_WRs[rock], moved_poses[:-1]])
         frames = np.concatenate([[0], np.insert(moved, held, moved[held] - 1)])
         poses = np.vstack([recording.X_WRs[rock], np.insert(moved_poses, held, before[held], axis=0)])
-        reach = float(radii[recording.rock_shape[rock]] * recording.rock_size[rock])
-        if calc_distances(poses, np.broadcast_to(poses[0], poses.shape), reach).max() > STILL_TOLERANCE:
-            chosen = thin_keyframes(frames, poses, reach, ROCK_TOLERANCE)
-            tracks[rock] = (frames[chosen], poses[chosen])
-    return tracks
+        reach[rock] = float(radii[recording.rock_shape[rock]] * recording.rock_size[rock])
+        if calc_distances(poses, poses[:1], reach[rock]).max() > STILL_TOLERANCE:
+            full[rock] = (frames, poses)
+    starts, frames, poses = join_tracks(list(full.values()))
+    reaches = np.array([reach[rock] for rock in full])
+    keep = thin_tracks(starts, frames, poses, reaches, ROCK_TOLERANCE)
+    return {
+        rock: (frames[first:last][keep[first:last]], poses[first:last][keep[first:last]])
+        for rock, first, last in zip(full, starts[:-1], starts[1:], strict=True)
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +86,9 @@ class PoseGrid:
         return np.rint(rounded).astype(np.int16)
 
 
-def join_tracks(tracks: list[Track]) -> tuple[NDArray[np.uint32], NDArray[np.uint16], Array]:
+def join_tracks(tracks: list[Track]) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Return where each track starts in the joined ones (n + 1,), and their frames (k,) and poses (k, 7)."""
-    start = np.cumsum([0, *(len(frames) for frames, _ in tracks)]).astype(np.uint32)
-    frames = np.concatenate([np.zeros(0, np.int64), *(frames for frames, _ in tracks)]).astype(np.uint16)
+    starts = np.cumsum([0, *(len(frames) for frames, _ in tracks)])
+    frames = np.concatenate([np.zeros(0, np.int64), *(frames for frames, _ in tracks)])
     poses = np.concatenate([np.zeros((0, 7)), *(poses for _, poses in tracks)])
-    return start, frames, poses
+    return starts, frames, poses

@@ -21,8 +21,8 @@ from drakerock.viewing.cycle_figures import (
     write_cycle_figures,
 )
 from drakerock.viewing.scene_figures import _find_outlines, calc_rock_poses, draw_scene
+from tests.cycle_files import COLUMNS
 from tests.unit.loading.test_planning import make_wedge
-from tests.unit.viewing.conftest import COLUMNS
 
 
 def test_rocks_are_where_they_were_last_seen(recording, heap):

@@ -16,7 +16,7 @@ from drakerock.viewing.replay import write_comparison, write_replay
 from drakerock.viewing.results import make_results
 from drakerock.viewing.scene_figures import calc_rock_poses
 from drakerock.viewing.stored_cycle import load_cycle
-from tests.unit.viewing.conftest import write_cycle
+from tests.cycle_files import write_cycle
 
 pytest.importorskip("choreographer", reason="no browser's driver: pip install 'drakerock[film]'")
 SEEN = ("load", "payload_share", "push", "down", "hinge", "speed", "slip", "wheels", "boom", "bucket")

@@ -17,7 +17,7 @@ from drakerock.viewing.results import calc_fill_per_kg, make_results, make_title
 from drakerock.viewing.scene_figures import calc_rock_poses
 from drakerock.viewing.stored_cycle import load_cycle
 from drakerock.viewing.tracks import ROCK_TOLERANCE, STILL_TOLERANCE, PoseGrid, join_tracks, make_rock_tracks
-from tests.unit.viewing.conftest import write_cycle
+from tests.cycle_files import write_cycle
 
 
 @pytest.fixture
