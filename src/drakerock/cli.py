@@ -116,7 +116,7 @@ def load(
         int | None, typer.Option(min=1, help="Run or resume a sequence of so many loadings.")
     ] = None,
     replay: Annotated[
-        bool, typer.Option(help="Write replay.html, of each loading; about SIZE MB at full size.")
+        bool, typer.Option(help="Write replay.html, of each loading; about 3 MB at full size.")
     ] = True,
     figures: Annotated[bool, typer.Option("--figures", help="Write the pictures, too, as PNG.")] = False,
     meshcat: Annotated[

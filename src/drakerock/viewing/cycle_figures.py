@@ -281,7 +281,7 @@ def _make_plan_figure(cycle: StoredCycle, plan: DigPlan) -> Figure:
     note = "" if plan.reached else ", the nearest that can be reached"
     ax.set_title(
         f"Plan at y = {plan.y:.2f} m, slope {np.rad2deg(plan.slope):.0f}°: cuts {plan.volume:.2f} of "
-        f"{plan.volume_wanted:.2f} m³{note} (shaded: {cut.area:.2f} m² times {width:.2f} m)",
+        f"{plan.volume_wanted:.2f} m³{note}\n(shaded: {cut.area:.2f} m² times {width:.2f} m)",
         loc="left", fontsize=10,
     )  # fmt: skip
     ax.legend(loc="upper left", fontsize=8)
