@@ -125,6 +125,11 @@ def test_results_are_those_of_the_outcome(folder):
     assert make_title(cycle).startswith("alpha 1.1, beta 0.6, gamma 1, kappa 0.6")
 
 
+def test_fill_factor_is_the_outcome_s_where_it_has_one(tmp_path, plan, recording):
+    cycle = load_cycle(write_cycle(tmp_path, plan, recording, {"mining": {"fill_factor": 0.77}}))
+    assert calc_fill_per_kg(cycle) * 8400.0 == pytest.approx(0.77)
+
+
 def test_a_loading_without_a_load_has_dashes(tmp_path, plan, recording):
     nothing = {
         "reason": "no candidate slice",
