@@ -61,8 +61,8 @@ def make_results(cycle: StoredCycle) -> list[Result]:
 def calc_fill_per_kg(cycle: StoredCycle) -> float | None:
     """Return the fill factor of a load of 1 kg: its loose volume over the bucket's heaped capacity.
 
-    As the outcome has it among the numbers of mining, so that both agree. Where it has none: a share of PACKING of loose
-    volume is rock, and the plan's wanted volume, alpha times the capacity, tells the latter; None without a plan.
+    As the outcome has it among the numbers of mining, so that both agree. Where it has none: a share of PACKING of
+    loose volume is rock, and the plan's wanted volume, alpha times the capacity, tells the latter; None without a plan.
     """
     load, known = cycle.outcome.get("bucket_mass_kg"), (cycle.outcome.get("mining") or {}).get("fill_factor")
     if load and known:
