@@ -62,7 +62,7 @@ class Scene {
     const viewer = (this.viewer = new MeshCat.Viewer(element, false));
     viewer.gui.domElement.remove();
     viewer.animator.update = () => {};
-    viewer.renderer.shadowMap.type = THREE.PCFSoftShadowMap;
+    viewer.renderer.shadowMap.type = THREE.PCFShadowMap;
     for (const name of ["Grid", "Axes", "Lights"]) viewer.scene_tree.find([name]).object.visible = false;
     viewer.set_property(["Background", "<object>"], "top_color", [0.93, 0.95, 0.97]);
     viewer.set_property(["Background", "<object>"], "bottom_color", [0.74, 0.76, 0.79]);
@@ -97,7 +97,7 @@ class Scene {
   }
 
   add(geometry, color, options = {}) {
-    const mesh = new THREE.Mesh(geometry, new THREE.MeshStandardMaterial({ color, roughness: 0.9, ...options }));
+    const mesh = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ color, ...options }));
     mesh.receiveShadow = true;
     this.root.add(mesh);
     return mesh;
@@ -139,7 +139,7 @@ class Scene {
       geometry.setAttribute("position", new THREE.Float32BufferAttribute(shape.vertices.flat(), 3));
       geometry.setIndex(shape.triangles.flat());
       const count = run.rock_shape.reduce((sum, s) => sum + (s === k), 0);
-      const material = new THREE.MeshStandardMaterial({ color: 0xffffff, roughness: 0.95, flatShading: true });
+      const material = new THREE.MeshLambertMaterial({ color: 0xffffff, flatShading: true });
       const mesh = new THREE.InstancedMesh(geometry, material, Math.max(count, 1));
       mesh.count = 0;
       mesh.castShadow = mesh.receiveShadow = true;
@@ -148,7 +148,9 @@ class Scene {
       return mesh;
     });
     const color = new THREE.Color();
-    for (let rock = 0; rock < n; ++rock) {
+    // The nearest to the side's eye first: what they hide is then not shaded.
+    const order = [...Array(n).keys()].sort((a, b) => run.rock_rest[5 * n + a] - run.rock_rest[5 * n + b]);
+    for (const rock of order) {
       const mesh = this.instances[run.rock_shape[rock]];
       this.place[rock] = mesh.count++;
       const rgb = [0, 1, 2].map((k) => run.rock_color[k * n + rock] / 255);
@@ -183,8 +185,8 @@ class Scene {
       geometry.setAttribute("position", new THREE.Float32BufferAttribute(visual.vertices, 3));
       geometry.setIndex(visual.triangles);
       const [r, g, b, a] = visual.rgba;
-      const material = new THREE.MeshStandardMaterial({ color: new THREE.Color().setRGB(r, g, b, THREE.SRGBColorSpace),
-        roughness: 0.6, flatShading: true, side: THREE.DoubleSide, transparent: a < 1, opacity: a });
+      const material = new THREE.MeshLambertMaterial({ color: new THREE.Color().setRGB(r, g, b, THREE.SRGBColorSpace),
+        flatShading: true, side: THREE.DoubleSide, transparent: a < 1, opacity: a });
       const mesh = new THREE.Mesh(geometry, material);
       mesh.castShadow = mesh.receiveShadow = true;
       this.bodies[visual.body].add(mesh);
