@@ -93,7 +93,7 @@ class Scene {
       near: 0.1, far: 5 * reach });
     sun.shadow.bias = -0.0006;
     sun.shadow.normalBias = 0.03;
-    this.root.add(sun, sun.target, new THREE.HemisphereLight(0xffffff, 0x8a8379, 1.7));
+    this.root.add(sun, sun.target, new THREE.HemisphereLight(0xffffff, 0xb5ada2, 3.4));
   }
 
   add(geometry, color, options = {}) {
