@@ -4,7 +4,7 @@ import numpy as np
 import pydrake.all as drake
 import typer
 
-from drakerock import FeedforwardController, get_pile, load_scenario, make_station, run_cycle
+from drakerock import FeedforwardController, get_pile, load_scenario, make_station, run_cycle, save_cycle
 from drakerock.viewing.replay import write_replay
 
 
@@ -32,7 +32,7 @@ def main(out: str = ""):
     station = make_station(scenario, get_pile(scenario), make_controller, visible=False)
     result = run_cycle(scenario, station.rocks.pile, station=station)
     print(f"{result.outcome.bucket_mass_kg:.0f} kg in the bucket at s4")
-    write_replay(result.recording, out) if out else None
+    write_replay(save_cycle(result, out)[0].parent) if out else None
     return result
 
 

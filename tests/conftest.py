@@ -17,6 +17,7 @@ from drakerock.lhd.config import MachineConfig
 from drakerock.lhd.geometry import make_bucket_geometry
 from drakerock.lhd.kinematics import make_kinematics
 from drakerock.lhd.model import add_machine
+from drakerock.loading.plan import DigPlan
 from drakerock.loading.planning import DiggingMachine
 from drakerock.loading.scenario import Scenario
 from drakerock.rocks.config import RocksConfig
@@ -53,9 +54,21 @@ def digger() -> DiggingMachine:
     )
 
 
+@pytest.fixture(scope="session")
+def plan(digger: DiggingMachine) -> DigPlan:
+    """A plan for an even slope."""
+    from tests.unit.loading.test_planning import make_wedge, plan_for
+
+    return plan_for(digger, make_wedge(), beta=0.6, kappa=0.6)
+
+
 @pytest.fixture
 def heap() -> PileState:
-    """Twelve rocks in a row of three layers on the floor, apart by a hair."""
+    return make_heap()
+
+
+def make_heap() -> PileState:
+    """Return twelve rocks in a row of three layers on the floor, apart by a hair."""
     rng = np.random.default_rng(3)
     p_WRs = np.array(
         [

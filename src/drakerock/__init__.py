@@ -40,6 +40,7 @@ _LAZY: dict[str, str] = {
     "pareto_front": "drakerock.exploration.pareto",
     "run_cycle": "drakerock.loading.cycle",
     "run_study": "drakerock.study.runner",
+    "save_cycle": "drakerock.loading.cycle",
     "scatter_rocks": "drakerock.rocks.making.scatter",
 }
 

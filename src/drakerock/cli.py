@@ -144,7 +144,7 @@ def load(
         int | None, typer.Option(min=1, help="Run or resume a sequence of so many loadings.")
     ] = None,
     replay: Annotated[
-        bool, typer.Option(help="Write replay.html, of each loading; about 13 MB at full size.")
+        bool, typer.Option(help="Write replay.html, of each loading; about 3 MB at full size.")
     ] = True,
     figures: Annotated[bool, typer.Option("--figures", help="Write the pictures, too, as PNG.")] = False,
     meshcat: Annotated[
@@ -202,25 +202,96 @@ def load(
         raise SimulationFailure(result.reason)
 
 
+LoadingFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished loading.")]
+
+
 @app.command()
 def replay(
     folder: Annotated[Path, typer.Argument(help="Folder of a finished cycle, or of a sequence.")],
 ) -> None:
-    """Make replay.html anew from a stored recording; of a sequence, each loading's.
+    """Make replay.html anew from what is stored; of a sequence, each loading's.
 
     Example: drakerock replay out/load
     """
-    from drakerock.loading.recording import load_recording
     from drakerock.viewing.replay import write_replay
 
     places = sorted(path.parent for path in folder.glob("loading_*/recording.npz"))
     if (folder / "recording.npz").exists() or not places:
         places = [folder]
+    pages = []
     with _show_progress("replay") as advance:
         for number, place in enumerate(places):
             advance("drawing", number / len(places), note=place.name)
-            write_replay(load_recording(place / "recording.npz"), place / "replay.html")
-    _print_paths([place / "replay.html" for place in places])
+            pages.append(write_replay(place, loadings=len(places)))
+    _print_paths(pages)
+
+
+@app.command()
+def compare(
+    a: Annotated[Path, typer.Argument(metavar="A", help="Folder of a finished loading.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Folder of another one.")],
+    out: Annotated[Path, typer.Option("--out", help="The page to write.")] = Path("compare.html"),
+    json_: JsonOption = False,
+) -> None:
+    """Compare two loadings: a table, and a page with both replays side by side and their histories overlaid.
+
+    Example: drakerock compare out/first out/second --out out/compare.html
+    """
+    from drakerock.files import make_folder
+    from drakerock.viewing.replay import write_comparison
+
+    make_folder(out.parent)
+    with _show_progress("compare"):
+        rows = write_comparison([a, b], out)
+    if json_:
+        print(json.dumps(rows))
+        return
+    table = Table("", "A", "B", "B - A", title=f"A: {a}   B: {b}", title_justify="left")
+    for row in rows:
+        table.add_row(Text(f"{row['label']} [{row['unit']}]" if row["unit"] else row["label"]), row["a"], row["b"],
+                      row["difference"])  # fmt: skip
+    output.print(table)
+    _print_paths([out])
+
+
+class Camera(StrEnum):
+    """Where a film is seen from."""
+
+    side = "side"
+    driver = "driver"
+    top = "top"
+    bucket = "bucket"
+
+
+@app.command()
+def film(
+    folder: LoadingFolder,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help=".mp4, .gif, or a folder for PNG pictures [default: RUN/film.mp4]."),
+    ] = None,
+    camera: Annotated[Camera, typer.Option(help="Where it is seen from.")] = Camera.side,
+    cut: Annotated[
+        float, typer.Option(min=0, max=1, help="Leave out rocks up to the machine's middle: 0 none, 1 all.")
+    ] = 0.0,
+    size: Annotated[str, typer.Option(help="Width x height in pixels, even.")] = "1280x720",
+    fps: Annotated[float, typer.Option(min=1, max=60, help="Pictures per second.")] = 15.0,
+    speed: Annotated[float, typer.Option(min=0.05, max=20, help="Times as fast as in truth.")] = 1.0,
+) -> None:
+    """Film a loading's replay, without a display: needs Chromium or Chrome and `pip install 'drakerock[film]'`.
+
+    Example: drakerock film out/load --camera driver --speed 2 --out out/load/driver.gif
+    """
+    from drakerock.viewing.film import FilmSettings, write_film
+
+    parts = size.lower().split("x")
+    if len(parts) != 2 or not all(part.isdigit() and int(part) > 0 for part in parts):
+        raise InputError(f"--size {size}: width x height in pixels, such as 1280x720")
+    settings = FilmSettings(fps, speed, int(parts[0]), int(parts[1]), camera.value, cut)
+    out = out or folder / "film.mp4"
+    with _show_progress("film") as advance:
+        write_film(folder, out, settings, lambda share: advance("filming", share))
+    _print_paths([out])
 
 
 machine_app = typer.Typer(no_args_is_help=True, help="The machine: its checks and its looks.")
@@ -400,15 +471,20 @@ def study_verify(folder: StudyFolder, json_: JsonOption = False) -> None:
 def study_report(
     source: Annotated[Path, typer.Argument(metavar="DIR", help="Study folder or response table.")],
     out: Annotated[Path | None, typer.Option(help="Folder to write into [default: DIR/report].")] = None,
+    replays: Annotated[
+        bool, typer.Option("--replays", help="Make each loading's replay first; the report leads to them.")
+    ] = False,
 ) -> None:
     """Fit, validate and explore; write one self-contained report.html with figures and numbers.
 
     Example: drakerock study report out/paper
+
+    Example: drakerock study report out/paper --replays
     """
     from drakerock.study.analysis import run_report
 
     with _show_progress("report") as advance:
-        paths = run_report(source, out, advance)
+        paths = run_report(source, out, advance, replays=replays)
     _print_paths(paths)
 
 

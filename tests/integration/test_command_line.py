@@ -14,6 +14,7 @@ import yaml
 from typer.testing import CliRunner
 
 from drakerock.cli import app
+from drakerock.errors import InputError
 from drakerock.loading.plan import DigPlan
 from drakerock.loading.scenario import load_scenario
 from drakerock.rocks.state import load_pile
@@ -92,6 +93,11 @@ def test_signals_have_units_and_obey_the_limits(place, loaded):
     # Nothing is prescribed: before the rocks the machine is at the planned speed, by its wheels' grip.
     free = (columns["mode"] == 0) & (columns["time"] > 0.6)
     assert np.allclose(columns["v_F"][free], 1.3, atol=0.05)
+    # The bucket's load is there over time, and at s4 it is what counts.
+    outcome = json.loads((place / "out" / "outcome.json").read_text())
+    at_s4 = np.interp(outcome["waypoint_times_s"][4], columns["time"], columns["bucket_load"])
+    assert at_s4 == pytest.approx(outcome["bucket_mass_kg"], rel=1e-6, abs=1.0)
+    assert columns["bucket_load"][0] == 0.0
     # The first row is of the machine in its place.
     assert abs(columns["x_T"][1] - columns["x_T"][0]) < 0.05
 
@@ -188,6 +194,36 @@ def test_replays_of_a_sequence_can_be_made_anew(place, sequence):
     assert all(page.exists() for page in pages)
 
 
+def test_two_loadings_are_compared(place, sequence):
+    folders = [str(place / "sequence" / f"loading_0{k}") for k in (0, 1)]
+    page = place / "compared" / "page.html"
+    result = CliRunner().invoke(app, ["compare", *folders, "--out", str(page), "--json"])
+    assert result.exit_code == 0, result.output
+    rows = {row["key"]: row for row in json.loads(result.stdout)}
+    for key, folder in zip("ab", folders, strict=True):
+        outcome = json.loads((Path(folder) / "outcome.json").read_text())
+        assert float(rows["load"][key]) == pytest.approx(outcome["bucket_mass_kg"] / 1e3, abs=0.005)
+        assert float(rows["damage"][key]) == pytest.approx(outcome["objectives"]["damage"], abs=5e-5)
+    assert page.stat().st_size > 100_000
+    table = CliRunner().invoke(app, ["compare", *folders, "--out", str(page)])
+    assert "% of payload" in table.stdout
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["compare", "nowhere", "nowhere"], "nowhere/plan.json: no such file"),
+        (["film", "nowhere", "--size", "wide"], "--size wide: width x height"),
+        (["film", "nowhere", "--out", "film.gif"], "nowhere/plan.json: no such file"),
+    ],
+)
+def test_what_cannot_be_shown_is_said(tmp_path, monkeypatch, args, message):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, args)
+    assert isinstance(result.exception, InputError)
+    assert message in str(result.exception)
+
+
 def test_json_prints_only_json_and_the_same_cycle_again(place, loaded):
     again = start("load", "small.yaml", "--out", "again", "--alpha", "0.4", "--json", cwd=place)
     assert again.returncode == 0, again.stderr
@@ -261,10 +297,21 @@ def test_bad_input_ends_the_process_with_exit_code_two(place):
 
 
 def test_every_command_has_help_with_an_example(run):
-    for command in (["load"], ["pile"], ["replay"], ["machine", "check"], ["machine", "show"]):
-        code, out, _ = run(*command, "--help")
+    commands = (
+        "load",
+        "pile",
+        "plan",
+        "replay",
+        "compare",
+        "film",
+        "machine check",
+        "machine show",
+        "study pack",
+    )
+    for command in commands:
+        code, out, _ = run(*command.split(), "--help")
         assert code == 0
-        assert "Example: drakerock " + " ".join(command) in out
+        assert "Example: drakerock " + command in out
 
 
 def test_empty_drift_ends_with_its_reason(run):

@@ -107,6 +107,7 @@ def run_cycle(
 
     pile_after = cycle.read_pile_after()
     signals, units = calc_signals(station, root)
+    signals["bucket_load"], units["bucket_load"] = cycle.calc_load_history(signals["time"]), "kg"
     in_bucket, debris = cycle.load, np.zeros(len(pile), bool)
     if cycle.t4 is not None and failure is None:
         in_bucket = cycle.load | cycle.find_load(pile_after)
@@ -164,6 +165,7 @@ class _Cycle:
         self.load: NDArray[np.bool_] = np.zeros(len(pile), bool)
         self.weighing: Weighing | None = None
         self.at_rest = True
+        self._loads: list[tuple[float, float]] = []
         self._last_pile, self._last_check, self._frame = pile, 0.0, 0
         self.recorder = Recorder(
             station.plant, station.scene_graph, station.machine, pile, station.shapes, station.scenario.site,
@@ -175,7 +177,9 @@ class _Cycle:
         mode = Mode(int(self._ports["mode"].Eval(self._root)[0]))
         time = self._root.get_time()
         body_poses = self._station.plant.get_body_poses_output_port().Eval(self._plant_context)
-        self.recorder.add(time, int(mode), body_poses, self._ports["pile"].Eval(self._root))
+        pile = self._ports["pile"].Eval(self._root)
+        self.recorder.add(time, int(mode), body_poses, pile)
+        self._loads.append((time, float(self.masses[self.find_load(pile)].sum())))
         if self._progress:
             self._progress(mode.name, time)
 
@@ -191,6 +195,7 @@ class _Cycle:
         self.at_rest = False
         self._last_pile = self._station.rocks.get_pile(self._root)
         self.load = self.find_load(self._last_pile)
+        self._loads.append((self.t4, float(self.masses[self.load].sum())))
 
     def wait_for_rest(self) -> None:
         """Simulate on from s4 until the machine is weighed and the rocks rest, or `settle_time` is over."""
@@ -222,6 +227,10 @@ class _Cycle:
         station = self._station
         bucket = station.plant.GetBodyByName("bucket", station.machine.instance)
         return find_bucket_load(pile, station.digger.bucket, bucket.EvalPoseInWorld(self._plant_context))
+
+    def calc_load_history(self, time: Array) -> Array:
+        """Return the bucket's load (k,) at the times of the steps [kg]: counted in each frame, linear in between."""
+        return np.interp(time, *np.array(self._loads).T)
 
     def read_pile_after(self) -> PileState:
         """Return the rocks as they are now; after a failure that left rocks that are nowhere, as last seen."""

@@ -24,9 +24,13 @@ Array = NDArray[np.float64]
 def find_bucket_load(pile: PileState, bucket: BucketGeometry, X_WB: RigidTransform) -> NDArray[np.bool_]:
     """Return which rocks are in the bucket (n,): centre of mass in the load region, between the side plates."""
     p_BRs = X_WB.inverse().multiply(np.asfortranarray(pile.p_WRs.T)).T if len(pile) else pile.p_WRs
-    region = shapely.Polygon(bucket.load_region)
-    inside = shapely.contains_xy(region, p_BRs[:, 0], p_BRs[:, 2])
-    return inside & (np.abs(p_BRs[:, 1]) <= 0.5 * bucket.inner_width) & ~pile.fixed
+    x, y, z = p_BRs.T
+    low, high = bucket.load_region.min(axis=0), bucket.load_region.max(axis=0)
+    inside = (np.abs(y) <= 0.5 * bucket.inner_width) & ~pile.fixed
+    inside &= (x >= low[0]) & (x <= high[0]) & (z >= low[1]) & (z <= high[1])
+    # Few rocks are left to be looked at one by one: this is asked in each frame of a recording.
+    inside[inside] = shapely.contains_xy(shapely.Polygon(bucket.load_region), x[inside], z[inside])
+    return inside
 
 
 def calc_damage(time: Array, moment: Array, start: float, end: float, tau_c: float, t_char: float) -> float:

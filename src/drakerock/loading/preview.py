@@ -40,6 +40,11 @@ class PlanPreview:
         plant.Finalize()
         self._digger = make_digging_machine(plant, scene_graph, machine)
 
+    @property
+    def bucket_width(self) -> float:
+        """Its outer width [m]."""
+        return self._digger.bucket.outer_width
+
     def plan(self, strategy: StrategyConfig) -> DigPlan | NoPlan:
         """Return the plan of a strategy."""
         config = self.scenario.loading

@@ -29,13 +29,18 @@ from drakerock.exploration.validation import calc_learning_curve, validate
 from drakerock.exploration.verdict import Verdict, judge
 from drakerock.files import read_json, write_text
 from drakerock.study.db import DATABASE
+from drakerock.study.replays import link_replays, write_study_replays
 from drakerock.study.tables import export_tables
 
 _CONFIRMATION = "confirmation.json"
 
 
 def run_report(
-    source: str | Path, out: str | Path | None = None, progress: Progress | None = None
+    source: str | Path,
+    out: str | Path | None = None,
+    progress: Progress | None = None,
+    *,
+    replays: bool = False,
 ) -> list[Path]:
     """Write the report of a study or table; returns the written paths, report.html first.
 
@@ -43,23 +48,28 @@ def run_report(
         source: study folder or table file.
         out: folder to write into; None: `report` in the study folder, or beside the table.
         progress: told what is being done.
+        replays: make the replay of each loading first; those that are there are linked anyway.
 
     Raises:
-        InputError: see `ResponseTable.load` and `explore`.
+        InputError: see `ResponseTable.load` and `explore`; replays asked for, and no recordings there.
     """
     # matplotlib and plotly take a second to import: only who wants a report pays for it.
     from drakerock.viewing.report import write_report
 
     source = Path(source)
+    if replays:
+        write_study_replays(source, progress)
     table, config, seed = _load(source)
     folder = _find_folder(source)
+    place = Path(out) if out else folder / "report"
+    table = link_replays(table, folder, place)
     confirmation = _read_confirmation(folder / _CONFIRMATION, table.problem)
     name = table.provenance.get("name")
     title = f"Exploration of {name}" if name else f"Exploration of {source.resolve().name}"
     exploration = explore(table, config, seed, confirmation, progress)
     if progress:
         progress("drawing", None)
-    return write_report(exploration, Path(out) if out else folder / "report", title)
+    return write_report(exploration, place, title)
 
 
 def run_strategy(

@@ -17,7 +17,6 @@ from drakerock.loading.cycle import run_cycle, save_cycle
 from drakerock.loading.live import make_live_station
 from drakerock.loading.mining import MINING
 from drakerock.loading.outcome import CycleOutcome
-from drakerock.loading.recording import load_recording
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.loading.sequence import run_sequence
 from drakerock.rocks.making.cache import fetch_pile
@@ -26,6 +25,7 @@ from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.site import make_site
 from drakerock.rocks.state import PileState, save_pile
 from drakerock.rocks.summary import calc_summary
+from drakerock.study.replays import update_replay
 from drakerock.viewing.cycle_figures import write_cycle_figures
 from drakerock.viewing.pile_figures import write_pile_picture
 from drakerock.viewing.pile_page import write_pile_page
@@ -81,8 +81,7 @@ def run_and_save(
     paths = save_cycle(result, folder)
     if result.recording is not None:
         if replay:
-            write_replay(result.recording, folder / "replay.html")
-            paths.append(folder / "replay.html")
+            paths.append(write_replay(folder))
         if figures:
             progress("drawing", None)
             paths += write_cycle_figures(folder)
@@ -121,12 +120,11 @@ def run_and_save_sequence(
         progress(stage, number / n_loadings, note=note)
 
     def show(place: Path) -> None:
-        recording, page = place / "recording.npz", place / "replay.html"
-        if not recording.exists():
+        if not (place / "recording.npz").exists():
             return
         progress("drawing", None, note=place.name)
-        if replay and not (page.exists() and page.stat().st_mtime >= recording.stat().st_mtime):
-            write_replay(load_recording(recording), page)
+        if replay:
+            update_replay(place, n_loadings)
         if figures:
             write_cycle_figures(place)
 

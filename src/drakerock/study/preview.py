@@ -28,6 +28,7 @@ class PreviewedStrategy:
         strategy: alpha, beta, gamma, kappa.
         field: the pile as it is seen.
         front_height: the pile is what is higher [m].
+        bucket_width: [m].
         plan: what would be tried.
         predicted: by a study; None without one.
     """
@@ -35,6 +36,7 @@ class PreviewedStrategy:
     strategy: StrategyConfig
     field: HeightField
     front_height: float
+    bucket_width: float
     plan: DigPlan | NoPlan
     predicted: Strategy | None
 
@@ -95,7 +97,9 @@ class PreviewedStrategy:
         save_plan(self.plan, self.field, folder / PLAN)
         profile = calc_pile_profile(self.field, self.front_height)
         plan = self.plan if isinstance(self.plan, DigPlan) else None
-        make_preview_figure(self.field, profile, plan).savefig(folder / "plan.png", dpi=110)
+        make_preview_figure(self.field, profile, plan, self.bucket_width).savefig(
+            folder / "plan.png", dpi=110
+        )
         return [folder / PLAN, folder / "plan.png"]
 
 
@@ -125,4 +129,7 @@ class Preview:
         """
         predicted = None if self.predictor is None else self.predictor.predict(strategy.model_dump())
         front_height = self.scenario.loading.sensing.front_height
-        return PreviewedStrategy(strategy, self.field, front_height, self._plans.plan(strategy), predicted)
+        plan = self._plans.plan(strategy)
+        return PreviewedStrategy(
+            strategy, self.field, front_height, self._plans.bucket_width, plan, predicted
+        )

@@ -20,6 +20,7 @@ from drakerock.loading.folder import HEIGHT_FIELDS
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.study.db import STUDY, Store
 from drakerock.study.objectives import get_objective
+from drakerock.study.replays import find_replay
 
 
 def read_responses(store: Store, role: str | None = None) -> ResponseTable:
@@ -40,6 +41,7 @@ def read_responses(store: Store, role: str | None = None) -> ResponseTable:
     roles: list[str] = []
     failures: list[str] = []
     failed: list[bool] = []
+    replays: list[str] = []
     rows: dict[tuple[str, int], list[tuple[int, str, str, str]]] = {}
     for point, attempt, *rest in store.db.execute(
         "SELECT point, attempt, loading, status, reason, outcome FROM cycles ORDER BY loading"
@@ -50,6 +52,7 @@ def read_responses(store: Store, role: str | None = None) -> ResponseTable:
         if point.status not in ("done", "failed"):
             continue
         cycles = rows.get((point.name, point.attempt), [])
+        replay = find_replay(store, point.name, point.attempt)
         for loading, status, reason, outcome in cycles or [(0, "failed", "", "")]:
             lost = point.status == "failed" or status == "failed"
             names.append(point.name)
@@ -62,6 +65,7 @@ def read_responses(store: Store, role: str | None = None) -> ResponseTable:
             )
             failed.append(lost)
             roles.append(point.role)
+            replays.append(replay)
             failures.append(reasons[point.name] if point.status == "failed" else reason)
     if not names:
         d, k = len(problem.variables), len(problem.objectives)
@@ -75,6 +79,7 @@ def read_responses(store: Store, role: str | None = None) -> ResponseTable:
         np.array(Y),
         roles,
         failures,
+        replays,
         failed=failed,
         provenance=provenance,
     )

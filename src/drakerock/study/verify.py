@@ -7,6 +7,7 @@ import sqlite3
 from dataclasses import dataclass
 
 from drakerock.study.db import DATABASE, POINTS, STUDY, Store, hash_file, write_neutral
+from drakerock.viewing.replay import REPLAY
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,8 @@ def verify_store(store: Store) -> list[Fault]:
     faults += _verify_outcomes(store)
     for path in sorted((store.folder / POINTS).rglob("*")):
         # Sequences that are not finished may hold files of loadings that are not finished.
-        if path.is_dir() or path in known or path.suffix == ".lock":
+        # Replays are made on demand, and again.
+        if path.is_dir() or path in known or path.suffix == ".lock" or path.name == REPLAY:
             continue
         if not any(path.is_relative_to(folder) for folder in open_folders):
             shown = path.relative_to(store.folder).as_posix()

@@ -7,86 +7,28 @@ folder and writes them all as PNG.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import matplotlib
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.transforms import blended_transform_factory
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
-from scipy.spatial.transform import Rotation
 
 from drakerock.errors import InputError
-from drakerock.files import read_json
 from drakerock.loading.field import HeightField, PileProfile, calc_pile_profile
 from drakerock.loading.plan import DigPlan
-from drakerock.loading.plan_file import load_plan
-from drakerock.loading.recording import Recording, load_recording
-from drakerock.loading.signal_table import load_signals
+from drakerock.loading.recording import Recording
+from drakerock.viewing.histories import History, make_histories
+from drakerock.viewing.results import make_title
+from drakerock.viewing.scene_figures import VIEWS, draw_scene
+from drakerock.viewing.stored_cycle import WAYPOINTS, StoredCycle, load_cycle
 
 Array = NDArray[np.float64]
 
-WAYPOINTS = ("s0", "s1", "s2", "s3", "s4")
-# Horizontal, vertical and depth axis of a view, and the depth's sign towards the eye.
-_VIEWS = {"side": (0, 2, 1, -1.0), "top": (0, 1, 2, 1.0)}
-
-# The machine's side view keeps boom and cylinders, this far before the cut; side plates and wheels are farther out [m].
-CORE = 0.6
 # So much of the void is shown [m].
 BEHIND_BROW = 1.7
-
-
-@dataclass(frozen=True, eq=False)
-class StoredCycle:
-    """A cycle's stored files, read.
-
-    Attributes:
-        outcome: outcome.json.
-        scenario: scenario.json, the resolved configuration.
-        plan: the dig plan; None if there was none.
-        field: the height field it was made from.
-        signals: columns (k,) of all steps.
-        recording: the frames.
-    """
-
-    outcome: dict[str, Any]
-    scenario: dict[str, Any]
-    plan: DigPlan | None
-    field: HeightField
-    signals: dict[str, Array]
-    recording: Recording
-
-
-def load_cycle(folder: str | Path) -> StoredCycle:
-    """Read what `drakerock load` wrote.
-
-    Raises:
-        InputError: a file is missing or cannot be read.
-    """
-    folder = Path(folder)
-    plan, field = load_plan(folder / "plan.json")
-    signals, _ = load_signals(folder / "signals.parquet")
-    return StoredCycle(
-        _read_object(folder / "outcome.json"),
-        _read_object(folder / "scenario.json"),
-        plan if isinstance(plan, DigPlan) else None,
-        field,
-        signals,
-        load_recording(folder / "recording.npz"),
-    )
-
-
-def _read_object(path: Path) -> dict[str, Any]:
-    data = read_json(path)
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a JSON object")
-    return data
 
 
 def draw_height_field(ax: Axes, field: HeightField, profile: PileProfile, plan: DigPlan | None) -> Axes:
@@ -120,20 +62,56 @@ def draw_height_field(ax: Axes, field: HeightField, profile: PileProfile, plan: 
     return ax
 
 
-def draw_plan(ax: Axes, plan: DigPlan) -> Axes:
-    """Draw a plan in the plane of x and z: the swept section, the tip's path and its waypoints."""
-    ax.fill(*plan.swept.T, facecolor="C1", edgecolor="C1", alpha=0.25, lw=0)
-    ax.plot(*np.vstack([plan.swept, plan.swept[:1]]).T, color="C1", lw=1.2, label="swept section")
+def calc_cut(plan: DigPlan, field: HeightField, width: float) -> shapely.Geometry:
+    """Return the pile that a plan cuts, in the plane of x and z: under the mean surface of the bucket's lane [m].
+
+    Its area times the width is the plan's volume but for what the surface varies across the lane.
+
+    Args:
+        plan: the plan.
+        field: what it was made from.
+        width: of the bucket [m].
+    """
+    columns = shapely.box(
+        field.x - 0.5 * field.cell, 0.0, field.x + 0.5 * field.cell, calc_lane(field, plan.y, width)
+    )
+    return shapely.union_all(shapely.intersection(columns, shapely.Polygon(plan.swept)))
+
+
+def calc_lane(field: HeightField, y: float, width: float) -> Array:
+    """Return the heights (nx,) averaged over a lane of some width about `y` [m]."""
+    half = 0.5 * field.cell
+    overlap = np.minimum(field.y + half, y + 0.5 * width) - np.maximum(field.y - half, y - 0.5 * width)
+    weights = np.maximum(overlap, 0.0)
+    return field.h @ (weights / weights.sum())
+
+
+def calc_bucket_width(recording: Recording) -> float:
+    """Return the bucket's width as it is seen [m]."""
+    looks = [v.vertices[:, 1] for v in recording.visuals if recording.bodies[v.body] == "bucket"]
+    return float(np.ptp(np.concatenate(looks)))
+
+
+def draw_plan(ax: Axes, plan: DigPlan, cut: shapely.Geometry) -> Axes:
+    """Draw a plan in the plane of x and z: the pile that is cut, the bucket's sweep, the tip's path, its waypoints."""
+    for k, part in enumerate(part for part in shapely.get_parts(cut) if isinstance(part, shapely.Polygon)):
+        ax.fill(
+            *np.asarray(part.exterior.coords).T,
+            fc="C1",
+            ec="none",
+            alpha=0.45,
+            label=None if k else "pile cut",
+        )
+    ax.plot(*np.vstack([plan.swept, plan.swept[:1]]).T, color="C1", lw=1.0, ls="--", label="bucket's sweep")
     ax.plot(plan.x, plan.z, "k-", lw=1.8, label="planned tip path")
     _mark_waypoints(ax, plan)
     return ax
 
 
-def draw_surface(ax: Axes, field: HeightField, y: float) -> Axes:
-    """Draw the sensed surface of the slice nearest to `y` [m] as steps."""
-    slice_ = int(np.argmin(np.abs(field.y - y)))
+def draw_surface(ax: Axes, field: HeightField, heights: Array) -> Axes:
+    """Draw heights (nx,) of the field's columns as steps."""
     edges = np.append(field.x - 0.5 * field.cell, field.x_end)
-    ax.stairs(field.h[:, slice_], edges, color="C0", lw=1.8, label="sensed height")
+    ax.stairs(heights, edges, color="C0", lw=1.8, label="sensed height, mean over the bucket's width")
     return ax
 
 
@@ -203,111 +181,6 @@ def draw_history(
     return ax
 
 
-def draw_scene(
-    ax: Axes, recording: Recording, frame: int, view: str, *, y_cut: float = 0.0, machine: bool = True
-) -> Axes:
-    """Draw rocks and machine at a frame, from the side cut open along the drift, or from above.
-
-    The side view looks along +y and leaves out whatever lies before the cut, so that the load in the bucket
-    shows. Rocks are the darker, the farther from the eye.
-
-    Args:
-        ax: where to draw.
-        recording: the cycle's.
-        frame: index of the frame.
-        view: ``side`` or ``top``.
-        y_cut: where the side view cuts [m].
-        machine: whether to draw it.
-    """
-    across, up, depth, towards_eye = _VIEWS[view]
-    poses = calc_rock_poses(recording, frame)
-    # Cut open along the drift; from above, what stands in the void would only set the greys.
-    shown = np.flatnonzero(poses[:, 5] >= y_cut if view == "side" else poses[:, 4] < 0.6)
-    R_WRs = Rotation.from_quat(poses[:, :4], scalar_first=True).as_matrix() if len(poses) else []
-    polygons: list[Array] = []
-    for rock in shown:
-        vertices, _ = recording.rock_shapes[recording.rock_shape[rock]]
-        flat = (recording.rock_size[rock] * vertices @ R_WRs[rock].T + poses[rock, 4:])[:, [across, up]]
-        polygons.append(flat[ConvexHull(flat).vertices])
-    nearness = towards_eye * poses[shown, 4 + depth]
-    rank = np.argsort(np.argsort(nearness)) / max(len(shown) - 1, 1)
-    colors = matplotlib.colormaps["Greys_r"](0.45 + 0.45 * rank)
-    edges = np.tile([0.2, 0.2, 0.2, 1.0], (len(shown), 1))
-    widths = np.full(len(shown), 0.25)
-    if machine:
-        for visual in recording.visuals:
-            corners = _place_visual(recording, frame, visual.body, visual.vertices)[visual.triangles]
-            middle = corners.mean(axis=1)
-            if view == "side":
-                kept = middle[:, 1] >= y_cut - CORE
-                corners, middle = corners[kept], middle[kept]
-            if len(corners) == 0:
-                continue
-            flats = corners[..., [across, up]]
-            polygons += list(flats)
-            nearness = np.concatenate([nearness, towards_eye * middle[:, depth]])
-            tint = np.tile(visual.rgba.astype(float), (len(flats), 1))
-            outlines = _find_outlines(flats)
-            polygons += outlines
-            # The bucket's outline shows through its load, other parts' where the part itself does.
-            nearest = np.inf if recording.bodies[visual.body] == "bucket" else nearness[-len(flats) :].max()
-            nearness = np.concatenate([nearness, np.full(len(outlines), nearest)])
-            colors = np.vstack([colors, tint, np.zeros((len(outlines), 4))])
-            edges = np.vstack([edges, tint, np.tile([0.0, 0.0, 0.0, 1.0], (len(outlines), 1))])
-            widths = np.concatenate([widths, np.full(len(flats), 0.25), np.full(len(outlines), 0.7)])
-    order = np.argsort(nearness, kind="stable")
-    ax.add_collection(
-        PolyCollection(
-            [polygons[k] for k in order],
-            facecolors=colors[order],
-            edgecolors=edges[order],
-            linewidths=widths[order],
-        )
-    )
-    _draw_site(ax, recording, view)
-    ax.set_aspect("equal")
-    return ax
-
-
-def _find_outlines(triangles: Array) -> list[Array]:
-    """Return the outer outlines (k, 2) of flat triangles (m, 3, 2)."""
-    flat = shapely.polygons(triangles)
-    # Triangles seen edge-on have no area; half a millimetre more closes the seams between the others. (Their union on
-    # a grid fails now and then.)
-    wide = shapely.buffer(flat[shapely.area(flat) > 1e-5], 5e-4, join_style="mitre")
-    union = shapely.buffer(shapely.union_all(wide), -5e-4, join_style="mitre")
-    return [np.asarray(p.exterior.coords) for p in shapely.get_parts(union) if isinstance(p, shapely.Polygon)]
-
-
-def calc_rock_poses(recording: Recording, frame: int) -> Array:
-    """Return the rocks' poses (n, 7) at a frame: quaternion (w, x, y, z) and position in W [m]."""
-    poses = np.array(recording.X_WRs, dtype=float)
-    until = recording.move_frame <= frame
-    # The rows are in the order of time, so that each rock keeps its latest.
-    poses[recording.move_rock[until]] = recording.move_pose[until]
-    return poses
-
-
-def _place_visual(recording: Recording, frame: int, body: int, vertices: NDArray[np.float32]) -> Array:
-    pose = recording.X_WBs[frame, body].astype(float)
-    R_WB = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
-    placed: Array = vertices.astype(float) @ R_WB.T + pose[4:]
-    return placed
-
-
-def _draw_site(ax: Axes, recording: Recording, view: str) -> None:
-    site = recording.site
-    half, height = 0.5 * site.drift_width, site.drift_height
-    if view == "side":
-        lean = np.tan(np.deg2rad(site.wall_lean_deg)) * (site.void_height - height)
-        ax.plot([-site.drift_length, site.void_depth, site.void_depth], [0, 0, site.void_height], "k-", lw=1)
-        ax.plot([-site.drift_length, 0, -lean], [height, height, site.void_height], "k-", lw=1)
-    else:
-        for y in (-half, half):
-            ax.axhline(y, color="k", lw=1)
-        ax.axvline(0.0, color="k", lw=1, ls="--")
-
-
 def draw_image_sequence(
     axes: Sequence[Axes], cycle: StoredCycle, view: str, frames: Sequence[tuple[str, int]]
 ) -> None:
@@ -369,10 +242,11 @@ def write_cycle_figures(folder: str | Path) -> list[Path]:
         figures["plan"] = _make_plan_figure(cycle, cycle.plan)
         figures["tip_path"] = _make_tip_path_figure(cycle, cycle.plan)
         figures["histories"] = _make_histories_figure(cycle)
-        for view in _VIEWS:
+        for view in VIEWS:
             figures[view] = _make_sequence_figure(cycle, view)
     paths = []
     for name, figure in figures.items():
+        figure.suptitle(make_title(cycle), fontsize=9, x=0.01, ha="left")
         path = folder / f"figure_{name}.png"
         try:
             figure.savefig(path, dpi=130)
@@ -395,8 +269,10 @@ def _make_plan_figure(cycle: StoredCycle, plan: DigPlan) -> Figure:
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     ax = figure.subplots()
     draw_scene(ax, cycle.recording, 0, "side", y_cut=plan.y, machine=False)
-    draw_plan(ax, plan)
-    draw_surface(ax, cycle.field, plan.y)
+    width = calc_bucket_width(cycle.recording)
+    cut = calc_cut(plan, cycle.field, width)
+    draw_plan(ax, plan, cut)
+    draw_surface(ax, cycle.field, calc_lane(cycle.field, plan.y, width))
     site = cycle.recording.site
     ax.set_xlim(float(plan.swept[:, 0].min()) - 1.0, min(site.void_depth + 0.2, BEHIND_BROW))
     ax.set_ylim(-0.3, site.drift_height + 0.7)
@@ -404,21 +280,24 @@ def _make_plan_figure(cycle: StoredCycle, plan: DigPlan) -> Figure:
     ax.set_ylabel("z [m]")
     note = "" if plan.reached else ", the nearest that can be reached"
     ax.set_title(
-        f"Plan at y = {plan.y:.2f} m: {plan.volume:.2f} of {plan.volume_wanted:.2f} m³{note}; "
-        f"slope {np.rad2deg(plan.slope):.0f}°",
-        loc="left", fontsize=11,
+        f"Plan at y = {plan.y:.2f} m, slope {np.rad2deg(plan.slope):.0f}°: cuts {plan.volume:.2f} of "
+        f"{plan.volume_wanted:.2f} m³{note}\n(shaded: {cut.area:.2f} m² times {width:.2f} m)",
+        loc="left", fontsize=10,
     )  # fmt: skip
     ax.legend(loc="upper left", fontsize=8)
     return figure
 
 
-def make_preview_figure(field: HeightField, profile: PileProfile, plan: DigPlan | None) -> Figure:
+def make_preview_figure(
+    field: HeightField, profile: PileProfile, plan: DigPlan | None, width: float
+) -> Figure:
     """Return a plan on a pile that is known by its height field only: from the side, and from above.
 
     Args:
         field: the pile as it is seen.
         profile: its curves.
         plan: what would be tried; None: there is none.
+        width: of the bucket [m].
     """
     figure = Figure(figsize=(9, 9), layout="constrained")
     side, top = figure.subplots(2, 1)
@@ -427,8 +306,8 @@ def make_preview_figure(field: HeightField, profile: PileProfile, plan: DigPlan 
     if plan is None:
         side.set_title("No plan", loc="left", fontsize=11)
         return figure
-    draw_surface(side, field, plan.y)
-    draw_plan(side, plan)
+    draw_surface(side, field, calc_lane(field, plan.y, width))
+    draw_plan(side, plan, calc_cut(plan, field, width))
     side.axhline(0.0, color="k", lw=0.8)
     side.set_xlim(float(plan.x.min()) - 0.5, field.x_end + 0.2)
     note = "" if plan.reached else ", the nearest that can be reached"
@@ -446,29 +325,28 @@ def _make_tip_path_figure(cycle: StoredCycle, plan: DigPlan) -> Figure:
 
 
 def _make_histories_figure(cycle: StoredCycle) -> Figure:
-    s, times = cycle.signals, cycle.outcome["waypoint_times_s"]
-    tau_c = cycle.scenario["loading"]["performance"]["tau_c"]
-    end = s["time"] <= (times[4] if times[4] is not None else s["time"][-1]) + 0.5
-    t = s["time"][end]
-    figure = Figure(figsize=(9.5, 9), layout="constrained")
-    axes = figure.subplots(4, 1, sharex=True)
-    forces = {
-        "push, backwards": -s["bucket_force_x"][end] / 1e3,
-        "load, downwards": -s["bucket_force_z"][end] / 1e3,
-    }
-    draw_history(axes[0], t, forces, "rocks on bucket [kN]", times)
-    draw_history(axes[1], t, {"hinge": s["hinge_moment"][end] / 1e3}, "hinge moment [kN m]", times)
-    axes[1].axhline(tau_c / 1e3, color="C3", ls="--", lw=1.2)
-    axes[1].annotate(
-        r"$\tau_c$", (1.0, tau_c / 1e3), xycoords=("axes fraction", "data"), xytext=(4, 0),
-        textcoords="offset points", va="center", fontsize=10,
-    )  # fmt: skip
-    torques = {name: s[f"torque_{name}"][end] / 1e3 for name in ("wheels", "boom", "bucket")}
-    draw_history(axes[2], t, torques, "motor torque [kN m]", times)
-    speeds = {"machine": s["v_F"][end], "wheels": (s["v_F"] + s["wheel_slip"])[end]}
-    draw_history(axes[3], t, speeds, "speed [m/s]", times)
-    axes[3].set_xlabel("time [s]")
+    histories, times = make_histories(cycle), cycle.outcome["waypoint_times_s"]
+    figure = Figure(figsize=(9.5, 10.5), layout="constrained")
+    axes = figure.subplots(len(histories), 1, sharex=True)
+    for ax, history in zip(axes, histories, strict=True):
+        _draw_history_of(ax, cycle, history, times)
+    axes[-1].set_xlabel("time [s]")
     return figure
+
+
+def _draw_history_of(ax: Axes, cycle: StoredCycle, history: History, times: Sequence[float | None]) -> None:
+    time = cycle.signals["time"]
+    # Half a second more than the loading: the load rocks in the bucket.
+    shown = time <= (times[4] if times[4] is not None else time[-1]) + 0.5
+    lines = {name: values[shown] for name, values in history.lines.items()}
+    draw_history(ax, time[shown], lines, f"{history.label} [{history.unit}]", times)
+    if history.limit:
+        name, level = history.limit
+        ax.axhline(level, color="C3", ls="--", lw=1.2)
+        ax.annotate(
+            name, (1.0, level), xycoords=("axes fraction", "data"), xytext=(4, 0), textcoords="offset points",
+            va="center", fontsize=9,
+        )  # fmt: skip
 
 
 def _make_sequence_figure(cycle: StoredCycle, view: str) -> Figure:

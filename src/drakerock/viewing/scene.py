@@ -20,13 +20,23 @@ RockMesh = tuple[Array, NDArray[np.int64]]
 # Warm greys by size class, told apart by lightness alone; the floor is darker than any rock.
 _ROCK_LIGHTNESS = (0.42, 0.78)
 _ROCK_HUE = np.array([1.0, 0.96, 0.9])
+_MOVED_HUE = np.array([1.0, 0.76, 0.50])
 _TWO_TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
 
 
 def calc_rock_colors(sizes: Array) -> dict[float, Array]:
     """Return the colour (3,) in [0, 1] of each size, the larger the lighter."""
+    return _shade(sizes, _ROCK_HUE)
+
+
+def calc_moved_colors(sizes: Array) -> dict[float, Array]:
+    """Return the colour (3,) in [0, 1] by size of rocks that move in a loading: brown, otherwise as the others."""
+    return _shade(sizes, _MOVED_HUE)
+
+
+def _shade(sizes: Array, hue: Array) -> dict[float, Array]:
     classes = np.unique(sizes)
-    return dict(zip(classes, np.linspace(*_ROCK_LIGHTNESS, len(classes))[:, None] * _ROCK_HUE, strict=True))
+    return dict(zip(classes, np.linspace(*_ROCK_LIGHTNESS, len(classes))[:, None] * hue, strict=True))
 
 
 def draw_still_rocks(

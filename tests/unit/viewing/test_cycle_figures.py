@@ -1,4 +1,3 @@
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,71 +12,17 @@ from drakerock.errors import InputError
 from drakerock.loading.field import calc_pile_profile
 from drakerock.loading.plan import NoPlan
 from drakerock.loading.plan_file import load_plan, save_plan
-from drakerock.loading.recording import Recording, Visual, save_recording
-from drakerock.loading.scenario import Scenario
-from drakerock.loading.signal_table import load_signals, save_signals
-from drakerock.rocks.config import SiteConfig
+from drakerock.loading.signal_table import load_signals
 from drakerock.viewing.cycle_figures import (
-    _find_outlines,
-    calc_rock_poses,
+    calc_cut,
+    calc_lane,
     draw_height_field,
-    draw_scene,
     draw_tip_paths,
     write_cycle_figures,
 )
-from tests.unit.loading.test_planning import make_wedge, plan_for
-
-COLUMNS = (
-    "x_T", "z_T", "bucket_force_x", "bucket_force_z", "hinge_moment", "torque_wheels", "torque_boom",
-    "torque_bucket", "v_F", "wheel_slip",
-)  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def plan(digger):
-    return plan_for(digger, make_wedge(), beta=0.6, kappa=0.6)
-
-
-@pytest.fixture
-def recording(heap, shapes):
-    box = np.array([[x, y, z] for x in (0, 1) for y in (-1, 1) for z in (0, 1)], np.float32)
-    triangles = np.array([[0, 2, 6], [0, 6, 4], [1, 3, 7], [1, 7, 5]], np.int32)
-    poses = np.tile(np.array([1, 0, 0, 0, -6.0, 0, 0.5], np.float32), (5, 1, 1))
-    poses[:, 0, 4] += np.arange(5)
-    n = len(heap)
-    return Recording(
-        times=np.arange(5) * 2.0,
-        modes=np.arange(5),
-        bodies=("bucket",),
-        X_WBs=poses,
-        visuals=(Visual(0, box, triangles, np.array([0.9, 0.7, 0.1, 1.0], np.float32)),),
-        rock_shapes=tuple((shape.vertices, shape.triangles) for shape in shapes),
-        rock_shape=heap.shape,
-        rock_size=heap.size,
-        rock_fixed=heap.fixed,
-        X_WRs=np.hstack([heap.q_WRs, heap.p_WRs]),
-        move_frame=np.array([1, 2, 3], np.int32),
-        move_rock=np.array([4, n - 1, 4], np.int32),
-        move_pose=np.array([[1, 0, 0, 0, -3.0, k, 1.0] for k in range(3)], np.float32),
-        site=SiteConfig(drift_width=3.9),
-        notes={},
-    )
-
-
-@pytest.fixture
-def folder(tmp_path, plan, recording):
-    save_plan(plan, make_wedge(), tmp_path / "plan.json")
-    time = np.arange(0, 8, 0.01)
-    rng = np.random.default_rng(0)
-    signals = {"time": time, "mode": np.minimum(time // 1.5, 5)} | {
-        k: rng.normal(size=len(time)) for k in COLUMNS
-    }
-    save_signals(signals, dict.fromkeys(signals, "1"), tmp_path / "signals.parquet")
-    save_recording(recording, tmp_path / "recording.npz")
-    outcome = {"waypoint_times_s": [1.5, 3.0, 3.0, 6.0, 7.5]}
-    (tmp_path / "outcome.json").write_text(json.dumps(outcome))
-    (tmp_path / "scenario.json").write_text(Scenario().model_dump_json())
-    return tmp_path
+from drakerock.viewing.scene_figures import _find_outlines, calc_rock_poses, draw_scene
+from tests.cycle_files import COLUMNS
+from tests.unit.loading.test_planning import make_wedge
 
 
 def test_rocks_are_where_they_were_last_seen(recording, heap):
@@ -122,6 +67,18 @@ def test_curves_and_entry_point_are_drawn_where_they_are(plan):
     assert np.array_equal(lines["centre of mass $x_m$"].get_xdata(), profile.x_mass)
     assert lines["entry point"].get_xdata()[0] == plan.waypoint_x[0]
     assert lines["entry point"].get_ydata()[0] == plan.y
+
+
+def test_shaded_area_times_width_is_the_planned_volume(plan, digger):
+    width = digger.bucket.outer_width
+    assert calc_cut(plan, make_wedge(), width).area * width == pytest.approx(plan.volume, rel=0.02)
+
+
+def test_lane_is_the_mean_over_the_width():
+    field = make_wedge()
+    field = replace(field, h=np.broadcast_to(field.y**2, field.h.shape))
+    expected = np.mean(np.linspace(-1.0, 2.0, 3001) ** 2)
+    assert calc_lane(field, 0.5, 3.0) == pytest.approx(np.full(len(field.x), expected), rel=0.05)
 
 
 def test_actual_path_is_that_from_s0_to_s4(plan):
