@@ -50,6 +50,7 @@ simulator.AdvanceTo(1.05)
 print(time.process_time() - start)
 """
 REFILL = """
+import inspect
 import time
 import numpy as np
 from drakerock import get_pile, load_scenario
@@ -60,7 +61,9 @@ scenario = load_scenario({scenario!r})
 pile = get_pile(scenario)
 removed = np.zeros(len(pile), bool)
 removed[np.argsort(np.linalg.norm(pile.p_WRs - [-3.0, 0.0, 0.5], axis=1) + 100.0 * pile.fixed)[:120]] = True
-shapes = load_rock_shapes(scenario.rocks.shapes)
+# Builds up to 23d883c take the names of the files.
+takes_files = "uris" in inspect.signature(load_rock_shapes).parameters
+shapes = load_rock_shapes(scenario.rocks.shapes if takes_files else scenario.rocks)
 start = time.process_time()
 refill(pile, removed, shapes, make_recipe(scenario), np.random.default_rng(0))
 print(time.process_time() - start)

@@ -141,7 +141,7 @@ def jammed():
         size=rng.choice([0.6, 0.8], n),
         quaternions=[draw_quaternion(rng) for _ in range(n)],
     )
-    engine = make_engine(pile, load_rock_shapes(RocksConfig().shapes), make_site(site))
+    engine = make_engine(pile, load_rock_shapes(RocksConfig()), make_site(site))
     arrays, _ = run(engine, engine.make_arrays(pile), 4.0)
     return engine.make_pile(arrays), site
 

@@ -95,16 +95,24 @@ def calc_motor_targets(
     Returns:
         (2 n,) positions (only the articulation's counts) and velocities of the n actuators, in Drake's order.
     """
-    rates = {
-        "articulation": 0.0,
-        "boom_joint": float(np.clip(boom, -machine.boom.velocity, machine.boom.velocity)),
-        "bucket_joint": float(np.clip(bucket, -machine.bucket.velocity, machine.bucket.velocity)),
-    }
-    wheel = float(np.clip(wheel, -machine.wheel.velocity, machine.wheel.velocity))
-    joints = [
+    return order_motor_targets(machine, find_motor_joints(plant, machine), wheel, boom, bucket)
+
+
+def find_motor_joints(plant: MultibodyPlant, machine: Machine) -> list[str]:
+    """Return the names of the joints that the machine's actuators turn, in Drake's order."""
+    return [
         plant.get_joint_actuator(index).joint().name()
         for index in plant.GetJointActuatorIndices(machine.instance)
     ]
+
+
+def order_motor_targets(
+    machine: Machine, joints: list[str], wheel: float, boom: float, bucket: float
+) -> np.ndarray:
+    """Return what `calc_motor_targets` does, for the joints that `find_motor_joints` found."""
+    limits = np.array([machine.wheel.velocity, machine.boom.velocity, machine.bucket.velocity])
+    wheel, boom, bucket = np.clip([wheel, boom, bucket], -limits, limits).tolist()
+    rates = {"articulation": 0.0, "boom_joint": boom, "bucket_joint": bucket}
     positions = [machine.steering_angle if name == "articulation" else 0.0 for name in joints]
     return np.array(positions + [rates.get(name, wheel) for name in joints])
 

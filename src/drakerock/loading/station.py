@@ -24,7 +24,7 @@ from drakerock.lhd.geometry import collision_pieces, make_bucket_geometry
 from drakerock.lhd.hinge import add_hinge_moment
 from drakerock.lhd.kinematics import make_kinematics
 from drakerock.lhd.measurement import add_machine_sensor
-from drakerock.lhd.model import Machine, add_machine, calc_motor_targets
+from drakerock.lhd.model import Machine, add_machine, find_motor_joints, order_motor_targets
 from drakerock.lhd.placement import set_machine_pose
 from drakerock.lhd.rocks import add_lhd_rocks
 from drakerock.loading.control import FeedforwardController
@@ -132,13 +132,12 @@ class MotorTargets(LeafSystem):
         """Make it for `machine` in the finalized `plant`."""
         super().__init__()
         self.set_name("motor_targets")
-        self._plant, self._machine = plant, machine
+        self._machine, self._joints = machine, find_motor_joints(plant, machine)
         self._speeds = self.DeclareVectorInputPort("motor_speeds", 3)
-        size = len(calc_motor_targets(plant, machine, 0.0, 0.0, 0.0))
-        self.DeclareVectorOutputPort("desired_state", size, self._calc, {self._speeds.ticket()})
+        self.DeclareVectorOutputPort("desired_state", 2 * len(self._joints), self._calc, {self._speeds.ticket()})
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(calc_motor_targets(self._plant, self._machine, *self._speeds.Eval(context)))
+        output.SetFromVector(order_motor_targets(self._machine, self._joints, *self._speeds.Eval(context)))
 
 
 def make_station(
@@ -172,7 +171,7 @@ def make_station(
     plant, scene_graph = add_plant(builder, dynamics)
     AddDrift(plant, site, dynamics.plant)
     machine = add_machine(plant, scenario.machine)
-    shapes = load_rock_shapes(scenario.rocks.shapes, scenario.rocks.max_corners)
+    shapes = load_rock_shapes(scenario.rocks)
     bodies = None
     if dynamics.rocks == "plant":
         bodies = AddRockBodies(

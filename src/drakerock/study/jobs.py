@@ -186,7 +186,7 @@ def make_pile_files(
     make_folder(folder)
     recipe = make_recipe(scenario)
     pile, source = fetch_pile(recipe, progress)
-    shapes = load_rock_shapes(scenario.rocks.shapes, scenario.rocks.max_corners)
+    shapes = load_rock_shapes(scenario.rocks)
     progress("measuring", None)
     site = make_site(scenario.site)
     moved = calc_creep(pile, shapes, recipe, scenario.pile.settle_window)
