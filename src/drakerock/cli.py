@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -13,6 +12,7 @@ import typer
 
 from drakerock import terminal
 from drakerock.errors import InputError, RunStopped, SimulationFailure
+from drakerock.logs import show_only_ours
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -34,7 +34,7 @@ SeedOption = Annotated[int | None, typer.Option(help="Seed of all randomness.")]
 
 def main() -> None:
     """Run the command line; bad input prints one message and exits with 2, a failed simulation with 1."""
-    logging.getLogger("drake").addFilter(_is_for_users)
+    show_only_ours()
     try:
         app()
     except InputError as error:
@@ -50,11 +50,6 @@ def main() -> None:
     except KeyboardInterrupt:
         terminal.get_console().print("interrupted")
         sys.exit(130)
-
-
-def _is_for_users(record: logging.LogRecord) -> bool:
-    """Return False for Drake's notes on how a scene was built and on the server of a page that is only written."""
-    return record.levelno >= logging.WARNING and "half spaces" not in record.getMessage()
 
 
 @app.command()

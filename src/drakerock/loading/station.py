@@ -134,7 +134,9 @@ class MotorTargets(LeafSystem):
         self.set_name("motor_targets")
         self._machine, self._joints = machine, find_motor_joints(plant, machine)
         self._speeds = self.DeclareVectorInputPort("motor_speeds", 3)
-        self.DeclareVectorOutputPort("desired_state", 2 * len(self._joints), self._calc, {self._speeds.ticket()})
+        self.DeclareVectorOutputPort(
+            "desired_state", 2 * len(self._joints), self._calc, {self._speeds.ticket()}
+        )
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(order_motor_targets(self._machine, self._joints, *self._speeds.Eval(context)))

@@ -19,6 +19,7 @@ from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.recording import load_recording
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.loading.sequence import run_sequence
+from drakerock.memory import freeze_imports
 from drakerock.rocks.making.cache import fetch_pile
 from drakerock.rocks.making.settle import calc_creep
 from drakerock.rocks.shapes import load_rock_shapes
@@ -68,6 +69,7 @@ def run_and_save(
         SimulationFailure: the pile could not be made.
     """
     make_folder(folder)
+    freeze_imports()
     pile = get_pile(scenario, progress)
     station = make_live_station(scenario, pile, meshcat) if meshcat else None
     result = run_cycle(
@@ -130,6 +132,7 @@ def run_and_save_sequence(
         if figures:
             write_cycle_figures(place)
 
+    freeze_imports()
     outcomes = run_sequence(scenario, n_loadings, folder, progress=tell, finished=show)
     places = [folder / f"loading_{number:02d}" for number in range(len(outcomes))]
     summary = calc_sequence_summary(outcomes)

@@ -220,7 +220,8 @@ class NonsmoothRocks(RockSystem):
             body = self._plant.get_body(BodyIndex(int(found.body[k])))
             raise InputError(
                 f"body '{body.scoped_name()}' starts {found.depth[k]:.2f} m inside a rock at "
-                f"{np.round(found.p_WCs[k], 2).tolist()}: place it outside the pile before the simulation starts"
+                f"{np.round(found.p_WCs[k], 2).tolist()}: place it outside the pile before the simulation starts "
+                "(in a station: station.initialize(context))"
             )
         return EventStatus.Succeeded()
 
