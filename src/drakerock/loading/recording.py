@@ -157,7 +157,7 @@ class Recorder:
             rock_fixed=self._pile.fixed,
             X_WRs=self._first,
             move_frame=np.repeat([f for f, _, _ in moves], [len(r) for _, r, _ in moves]).astype(np.int32),
-            move_rock=np.concatenate([r for _, r, _ in moves] or [np.zeros(0)]).astype(np.int32),
+            move_rock=np.concatenate([r for _, r, _ in moves] or [np.zeros(0, np.int64)]).astype(np.int32),
             move_pose=np.concatenate([p for _, _, p in moves] or [np.zeros((0, 7))]).astype(np.float32),
             site=self._site,
             notes=notes,

@@ -1,4 +1,7 @@
-"""Single jobs: a scenario in; a folder with a pile, or with one loading cycle, out."""
+"""Single jobs: a scenario in; a folder with a pile, or with one loading cycle, out.
+
+What draws pictures is imported by those that do: it takes longer to import than Drake.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +29,6 @@ from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.site import make_site
 from drakerock.rocks.state import PileState, save_pile
 from drakerock.rocks.summary import calc_summary
-from drakerock.viewing.cycle_figures import write_cycle_figures
-from drakerock.viewing.pile_figures import write_pile_picture
-from drakerock.viewing.pile_page import write_pile_page
 from drakerock.viewing.replay import write_replay
 
 # Woken rocks of a pile at rest creep no faster: 30 mm in 5 s [m/s].
@@ -86,6 +86,8 @@ def run_and_save(
             write_replay(result.recording, folder / "replay.html")
             paths.append(folder / "replay.html")
         if figures:
+            from drakerock.viewing.cycle_figures import write_cycle_figures
+
             progress("drawing", None)
             paths += write_cycle_figures(folder)
     return result.outcome, paths
@@ -130,6 +132,8 @@ def run_and_save_sequence(
         if replay and not (page.exists() and page.stat().st_mtime >= recording.stat().st_mtime):
             write_replay(load_recording(recording), page)
         if figures:
+            from drakerock.viewing.cycle_figures import write_cycle_figures
+
             write_cycle_figures(place)
 
     freeze_imports()
@@ -186,6 +190,9 @@ def make_pile_files(
         InputError: bad configuration, or the folder cannot be written.
         SimulationFailure: the pile could not be made.
     """
+    from drakerock.viewing.pile_figures import write_pile_picture
+    from drakerock.viewing.pile_page import write_pile_page
+
     make_folder(folder)
     recipe = make_recipe(scenario)
     pile, source = fetch_pile(recipe, progress)
