@@ -30,7 +30,7 @@ from drakerock.rocks.state import save_pile
 from drakerock.rocks.summary import calc_summary
 
 RECIPE = make_recipe(Scenario())
-SHAPES = load_rock_shapes(RECIPE.rocks.shapes)
+SHAPES = load_rock_shapes(RECIPE.rocks)
 
 
 def bench_make() -> None:

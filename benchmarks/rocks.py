@@ -39,7 +39,7 @@ from drakerock.rocks.site import make_site, make_surroundings
 from drakerock.rocks.state import PileState, load_pile
 
 ROCKS = RocksConfig()
-SHAPES = load_rock_shapes(ROCKS.shapes)
+SHAPES = load_rock_shapes(ROCKS)
 SITE = SiteConfig()
 TIME_STEP = 0.01
 

@@ -39,7 +39,7 @@ settings.load_profile("drakerock")
 
 @pytest.fixture(scope="session")
 def shapes() -> tuple[RockShape, ...]:
-    return load_rock_shapes(RocksConfig().shapes)
+    return load_rock_shapes(RocksConfig())
 
 
 @pytest.fixture(scope="session")

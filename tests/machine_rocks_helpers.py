@@ -37,7 +37,7 @@ class Scene:
     def __init__(self, pile, rates, site=None, dynamics=None, rocks=None, shapes=None, **pose):
         self.dynamics = dynamics or DynamicsConfig()
         rocks = rocks or RocksConfig()
-        self.shapes = shapes or load_rock_shapes(rocks.shapes)
+        self.shapes = shapes or load_rock_shapes(rocks)
         self.site = make_site(site or SiteConfig())
         builder = DiagramBuilder()
         self.plant, self.scene_graph = add_plant(builder, self.dynamics)

@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import json
-import logging
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
-from rich.text import Text
 
+from drakerock import terminal
 from drakerock.cli_new import new_app
 from drakerock.errors import InputError, RunStopped, SimulationFailure
+from drakerock.logs import show_only_ours
 
 app = typer.Typer(
     invoke_without_command=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # its help imports rich and a Markdown parser
 )
-console = Console(stderr=True)
-output = Console()
 
 ScenarioArgument = Annotated[
     Path | None, typer.Argument(help="Scenario YAML file; left out: the shipped studies/demo.yaml.")
@@ -64,37 +58,27 @@ def start(
 ) -> None:
     """Simulation-based development of robotic rock loading, built on Drake."""
     if context.invoked_subcommand is None:
-        output.print(Text(FIRST_STEPS), soft_wrap=True)
+        terminal.print_line(FIRST_STEPS)
 
 
 def main() -> None:
     """Run the command line; bad input prints one message and exits with 2, a failed simulation with 1."""
-    logging.getLogger("drake").addFilter(_is_for_users)
+    show_only_ours()
     try:
         app()
     except InputError as error:
-        _print_error("error", error)
+        terminal.print_error("error", error)
         sys.exit(2)
     except SimulationFailure as error:
-        _print_error("failed", error)
+        terminal.print_error("failed", error)
         sys.exit(1)
     except RunStopped as error:
-        _print_error("stopped", error)
-        console.print("what was finished is stored; the same command goes on")
+        terminal.print_error("stopped", error)
+        terminal.get_console().print("what was finished is stored; the same command goes on")
         sys.exit(1)
     except KeyboardInterrupt:
-        console.print("interrupted")
+        terminal.get_console().print("interrupted")
         sys.exit(130)
-
-
-def _is_for_users(record: logging.LogRecord) -> bool:
-    """Return False for Drake's notes on how a scene was built and on the server of a page that is only written."""
-    return record.levelno >= logging.WARNING and "half spaces" not in record.getMessage()
-
-
-def _print_error(word: str, error: Exception) -> None:
-    # Text, not markup: a message may hold brackets.
-    console.print(Text(f"{word}: ", "bold red").append(str(error), "default"), soft_wrap=True)
 
 
 @app.command()
@@ -111,22 +95,13 @@ def pile(
     """
     from drakerock.study.jobs import make_pile_files
 
-    with _show_progress("pile") as advance:
+    with terminal.show_progress("pile") as advance:
         summary, paths = make_pile_files(_load(scenario, seed, set_), out, advance)
     if json_:
         print(json.dumps(summary))
         return
-    gradation = Table(title="Gradation", title_justify="left")
-    for name in ("sieve width", "rocks", "mass", "share", "wanted"):
-        gradation.add_column(name, justify="right")
-    for item in summary.pop("gradation"):
-        gradation.add_row(
-            f"{item['size_m']:g} m", f"{item['rocks']}", f"{item['mass_kg'] / 1e3:.1f} t",
-            f"{100 * item['share']:.1f} +- {100 * item['standard_error']:.1f} %", f"{100 * item['wanted']:.0f} %",
-        )  # fmt: skip
-    _print_table("Pile", summary)
-    output.print(gradation)
-    _print_paths(paths)
+    terminal.print_pile(summary)
+    terminal.print_paths(paths)
 
 
 @app.command()
@@ -175,27 +150,27 @@ def load(
         raise InputError("--meshcat: shows one cycle; leave out --loadings")
     if loadings is not None:
         stopped = "loadings that were finished are stored; the same command goes on"
-        with use_folder(out, force=force, sequence=True), _show_progress("load", stopped) as advance:
+        with use_folder(out, force=force, sequence=True), terminal.show_progress("load", stopped) as advance:
             summary, paths = run_and_save_sequence(
                 config, loadings, out, advance, replay=replay, figures=figures
             )
         if json_:
             print(json.dumps(summary))
         else:
-            _print_sequence(summary)
-            _print_paths(paths)
+            terminal.print_sequence(summary)
+            terminal.print_paths(paths)
         if summary["failed"]:
             raise SimulationFailure(summary["reasons"][-1])
         return
     live = _start_meshcat() if meshcat else None
     stopped = f"nothing was written to {out}"
-    with use_folder(out, force=force, sequence=False), _show_progress("load", stopped) as advance:
+    with use_folder(out, force=force, sequence=False), terminal.show_progress("load", stopped) as advance:
         result, paths = run_and_save(config, out, advance, replay=replay, figures=figures, meshcat=live)
     if json_:
         print(result.to_json(), end="")
     else:
-        _print_outcome(result)
-        _print_paths(paths)
+        terminal.print_outcome(result)
+        terminal.print_paths(paths)
     if live and sys.stdin.isatty():
         input("Press Enter to close the live view. ")
     if result.status == "failed":
@@ -219,11 +194,11 @@ def replay(
     if (folder / "recording.npz").exists() or not places:
         places = [folder]
     pages = []
-    with _show_progress("replay") as advance:
+    with terminal.show_progress("replay") as advance:
         for number, place in enumerate(places):
             advance("drawing", number / len(places), note=place.name)
             pages.append(write_replay(place, loadings=len(places)))
-    _print_paths(pages)
+    terminal.print_paths(pages)
 
 
 @app.command()
@@ -241,17 +216,13 @@ def compare(
     from drakerock.viewing.replay import write_comparison
 
     make_folder(out.parent)
-    with _show_progress("compare"):
+    with terminal.show_progress("compare"):
         rows = write_comparison([a, b], out)
     if json_:
         print(json.dumps(rows))
         return
-    table = Table("", "A", "B", "B - A", title=f"A: {a}   B: {b}", title_justify="left")
-    for row in rows:
-        table.add_row(Text(f"{row['label']} [{row['unit']}]" if row["unit"] else row["label"]), row["a"], row["b"],
-                      row["difference"])  # fmt: skip
-    output.print(table)
-    _print_paths([out])
+    terminal.print_comparison(rows, str(a), str(b))
+    terminal.print_paths([out])
 
 
 class Camera(StrEnum):
@@ -289,9 +260,9 @@ def film(
         raise InputError(f"--size {size}: width x height in pixels, such as 1280x720")
     settings = FilmSettings(fps, speed, int(parts[0]), int(parts[1]), camera.value, cut)
     out = out or folder / "film.mp4"
-    with _show_progress("film") as advance:
+    with terminal.show_progress("film") as advance:
         write_film(folder, out, settings, lambda share: advance("filming", share))
-    _print_paths([out])
+    terminal.print_paths([out])
 
 
 machine_app = typer.Typer(no_args_is_help=True, help="The machine: its checks and its looks.")
@@ -309,12 +280,12 @@ def machine_check(
     from drakerock.lhd.checks.checks import run_machine_checks
     from drakerock.lhd.checks.rows import make_check_data, make_check_table
 
-    with _show_progress("machine check"):
+    with terminal.show_progress("machine check"):
         rows = run_machine_checks(_load(scenario, None, set_).machine)
     if json_:
         print(json.dumps(make_check_data(rows)))
     else:
-        output.print(make_check_table(rows))
+        terminal.get_output().print(make_check_table(rows))
     if any(row.passed is False for row in rows):
         raise SimulationFailure(
             "the machine misses " + ", ".join(row.name for row in rows if row.passed is False)
@@ -333,9 +304,9 @@ def machine_show(
     from drakerock.lhd.checks.page import write_machine_page
 
     make_folder(out)
-    with _show_progress("machine show"):
+    with terminal.show_progress("machine show"):
         path = write_machine_page(_load(scenario, None, set_).machine, out / "machine.html")
-    _print_paths([path])
+    terminal.print_paths([path])
 
 
 app.add_typer(new_app, name="new")
@@ -366,13 +337,13 @@ def study_run(
     from drakerock.study.schema import load_study
 
     config = load_study(study, set_ or ())
-    with Display(console) as display:
+    with Display(terminal.get_console()) as display:
         status = run_study(config, out, workers=workers, scheduler=scheduler, display=display)
     if json_:
         print(json.dumps(status))
         return
-    output.print(make_status_table(status))
-    _print_paths(
+    terminal.get_output().print(make_status_table(status))
+    terminal.print_paths(
         [out / f"{name}.{suffix}" for suffix in ("csv", "parquet") for name in ("responses", "loadings")]
     )
 
@@ -392,7 +363,7 @@ def study_status(folder: StudyFolder, json_: JsonOption = False) -> None:
     if json_:
         print(json.dumps(status))
     else:
-        output.print(make_status_table(status))
+        terminal.get_output().print(make_status_table(status))
 
 
 @study_app.command("export")
@@ -406,7 +377,7 @@ def study_export(
     """
     from drakerock.study.tables import export_tables
 
-    _print_paths(export_tables(folder, [format_]))
+    terminal.print_paths(export_tables(folder, [format_]))
 
 
 @study_app.command("pack")
@@ -423,11 +394,11 @@ def study_pack(
     """
     from drakerock.study.packing import pack_study
 
-    with _show_progress("pack"):
+    with terminal.show_progress("pack"):
         path = pack_study(
             folder, out or folder.with_name(f"{folder.resolve().name}.tar.xz"), everything=everything
         )
-    _print_paths([path])
+    terminal.print_paths([path])
 
 
 @study_app.command("unpack")
@@ -441,9 +412,9 @@ def study_unpack(
     """
     from drakerock.study.packing import unpack_study
 
-    with _show_progress("unpack"):
+    with terminal.show_progress("unpack"):
         unpack_study(path, folder)
-    _print_paths([folder])
+    terminal.print_paths([folder])
 
 
 @study_app.command("verify")
@@ -461,8 +432,8 @@ def study_verify(folder: StudyFolder, json_: JsonOption = False) -> None:
         print(json.dumps([vars(fault) for fault in faults]))
     else:
         for fault in faults:
-            output.print(Text(f"{fault.kind}: {fault.path} {fault.message}"), soft_wrap=True)
-        output.print(f"{len(faults)} faults" if faults else "no faults")
+            terminal.print_line(f"{fault.kind}: {fault.path} {fault.message}")
+        terminal.get_output().print(f"{len(faults)} faults" if faults else "no faults")
     if faults:
         raise typer.Exit(1)
 
@@ -483,9 +454,9 @@ def study_report(
     """
     from drakerock.study.analysis import run_report
 
-    with _show_progress("report") as advance:
+    with terminal.show_progress("report") as advance:
         paths = run_report(source, out, advance, replays=replays)
-    _print_paths(paths)
+    terminal.print_paths(paths)
 
 
 @study_app.command("confirm")
@@ -506,17 +477,17 @@ def study_confirm(
     from drakerock.study.resimulation import Resimulation
 
     def say(text: str) -> None:
-        console.print(Text(text), soft_wrap=True)
+        terminal.print_line(text, terminal.get_console())
 
     again = Resimulation(folder, workers=workers, scheduler=scheduler, say=say)
-    with _show_progress("confirm") as advance:
+    with terminal.show_progress("confirm") as advance:
         confirmation = run_confirm(folder, again.evaluate, points, again.run, advance)
         report = run_report(folder, None, advance)[0]
     if json_:
         print(json.dumps(confirmation.to_rows(), indent=2))
     else:
         print(format_confirmation(confirmation))
-        _print_paths([folder / "confirmation.json", report])
+        terminal.print_paths([folder / "confirmation.json", report])
 
 
 @app.command()
@@ -550,7 +521,7 @@ def strategy(
     if knee + (weights is not None) + (best is not None) > 1:
         raise InputError("--knee, --weights and --best exclude each other")
     limits = [part for text in bound or [] for part in text.split(",") if part.strip()]
-    with _show_progress("strategy") as advance:
+    with terminal.show_progress("strategy") as advance:
         chosen = run_strategy(source, weights, limits, advance, best=best, probability=probability)
     print(json.dumps(chosen.to_dict(), indent=2) if json_ else chosen.to_text())
 
@@ -584,12 +555,14 @@ def plan(
     strategy = {"alpha": alpha, "beta": beta, "gamma": gamma, "kappa": kappa}
     overrides = [f"loading.strategy.{key}={value}" for key, value in strategy.items() if value is not None]
     config = _load(scenario, None, [*(set_ or []), *overrides])
-    with _show_progress("plan"):
+    with terminal.show_progress("plan"):
         preview = Preview(config, pile, study)
     if serve:
         from drakerock.study.preview_server import serve_preview
 
-        serve_preview(preview, lambda address: output.print(f"plan page: {address} (Ctrl-C ends it)"))
+        serve_preview(
+            preview, lambda address: terminal.get_output().print(f"plan page: {address} (Ctrl-C ends it)")
+        )
         return
     shown = preview.describe(config.loading.strategy)
     if json_:
@@ -597,7 +570,7 @@ def plan(
     else:
         print(shown.to_text())
     if out is not None:
-        _print_paths(shown.save(out))
+        terminal.print_paths(shown.save(out))
 
 
 class FileKind(StrEnum):
@@ -631,7 +604,7 @@ def _start_meshcat() -> Any:
         meshcat = Meshcat()
     except RuntimeError as error:
         raise InputError(f"--meshcat: no server can be started: {error}") from None
-    output.print(f"live view: {meshcat.web_url()}")
+    terminal.get_output().print(f"live view: {meshcat.web_url()}")
     return meshcat
 
 
@@ -640,142 +613,3 @@ def _load(path: Path | None, seed: int | None, overrides: list[str] | None) -> A
 
     extra = [f"seed={seed}"] if seed is not None else []
     return load_scenario(path, [*(overrides or []), *extra])
-
-
-@contextmanager
-def _show_progress(name: str, stopped: str = "") -> Iterator[Callable[..., None]]:
-    """Show what is being done on standard error; plain (and silent) when that is not a terminal.
-
-    Ctrl-C is answered with where it stopped, and `stopped`, what that means.
-    """
-    where = name
-    columns = (TextColumn("[bold]{task.fields[stage]:<18}"), BarColumn(), TextColumn("{task.fields[note]}"))
-    with Progress(
-        *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
-    ) as progress:
-        task = progress.add_task(name, total=None, stage=name, note="")
-
-        def advance(stage: str, share: float | None = None, note: str = "") -> None:
-            nonlocal where
-            where = f"{stage}, {note}" if note else stage
-            progress.update(
-                task, stage=stage, total=None if share is None else 1.0, completed=share or 0, note=note
-            )
-
-        try:
-            yield advance
-        except KeyboardInterrupt:
-            progress.stop()
-            console.print(Text(f"interrupted at: {where}"), soft_wrap=True)
-            if stopped:
-                console.print(Text(stopped), soft_wrap=True)
-            raise typer.Exit(130) from None
-
-
-def _print_outcome(outcome: Any) -> None:
-    from drakerock.loading.mining import describe_mining
-
-    table = Table(title="Loading cycle", show_header=False, title_justify="left")
-    table.add_column(style="bold")
-    table.add_column()
-    s = outcome.strategy
-
-    def show(value: float | None, form: str) -> str:
-        return "-" if value is None else form.format(value)
-
-    table.add_row("strategy", "  ".join(f"{key} {value:g}" for key, value in s.items()))
-    table.add_row("ended", f"{outcome.status}: {outcome.reason}")
-    table.add_row("production", show(outcome.objectives["production"], "{:.0f} kg/s"))
-    table.add_row("damage", show(outcome.objectives["damage"], "{:.4f}"))
-    table.add_row("debris", show(outcome.objectives["debris"], "{:.0f} kg"))
-    mass = show(outcome.bucket_mass_kg, "{:.0f} kg")
-    table.add_row("bucket load", f"{mass} in {show(outcome.bucket_rocks, '{:d}')} rocks")
-    counted = show(outcome.counted_when_weighed_kg, "{:.0f} kg")
-    table.add_row("weighed", f"{show(outcome.weighed_mass_kg, '{:.0f} kg')} (counted then: {counted})")
-    table.add_row("loading time t4 - t0", show(outcome.loading_time_s, "{:.2f} s"))
-    table.add_row("t0 ... t4", "  ".join(show(t, "{:.2f}") for t in outcome.waypoint_times_s) + " s")
-    if "volume_m3" in outcome.plan:
-        plan = outcome.plan
-        note = "" if plan["volume_reached"] else " (the nearest that can be reached)"
-        table.add_row("planned volume", f"{plan['volume_m3']:.2f} of {plan['volume_wanted_m3']:.2f} m3{note}")
-    table.add_row("push force mean, peak", f"{show(_kilo(outcome.mean_push_force_N), '{:.0f}')}, "
-                  f"{show(_kilo(outcome.peak_push_force_N), '{:.0f}')} kN")  # fmt: skip
-    table.add_row("motors' work", show(_kilo(outcome.energy_J), "{:.0f} kJ"))
-    for label, text in describe_mining(outcome.mining or {}):
-        table.add_row(label, text)
-    events = ", ".join(f"{item['event']} at {item['time_s']:.2f} s" for item in outcome.events) or "none"
-    table.add_row("events", events)
-    rocks = outcome.rocks
-    table.add_row(
-        "rocks",
-        f"{rocks['total']:.0f}, awake {rocks['awake_mean']:.0f} mean, {rocks['awake_max']:.0f} max; "
-        f"{rocks['lost']} lost; overlap up to {1e3 * rocks['penetration_max_m']:.0f} mm; "
-        f"{rocks['flagged_steps']} steps flagged",
-    )
-    table.add_row(
-        "cost",
-        f"{outcome.wall_time_s:.1f} s for {outcome.sim_time_s:.1f} s, {outcome.ms_per_step:.1f} CPU ms per step",
-    )
-    output.print(table)
-
-
-def _print_sequence(summary: dict[str, Any]) -> None:
-    strategy = "  ".join(f"{key} {value:g}" for key, value in summary["strategy"].items())
-    title = f"{summary['loadings']} loadings, {strategy}"
-    table = Table(title=title, title_justify="left", expand=True)
-    rows = {
-        "production": ("production [kg/s]", "{:.0f}"),
-        "damage": ("damage", "{:.4f}"),
-        "debris": ("debris [kg]", "{:.0f}"),
-        "bucket_mass_kg": ("bucket load [kg]", "{:.0f}"),
-        "weighed_mass_kg": ("weighed [kg]", "{:.0f}"),
-        "loading_time_s": ("loading time [s]", "{:.2f}"),
-        "energy_J": ("motors' work [J]", "{:.3g}"),
-        "payload_percent": ("payload [%]", "{:.1f}"),
-        "fill_factor": ("fill factor", "{:.2f}"),
-        "bucket_phase_kWh_per_t": ("energy of the bucket phase [kWh/t]", "{:.3f}"),
-        "loading_kWh_per_t": ("energy of the loading [kWh/t]", "{:.3f}"),
-        "tractive_effort_mean_N": ("tractive effort, mean [N]", "{:.3g}"),
-        "tractive_effort_peak_N": ("tractive effort, peak [N]", "{:.3g}"),
-        "wheel_slip_m": ("wheel slip [m]", "{:.2f}"),
-        "breakout_use": ("breakout use", "{:.2f}"),
-        "spillage_share": ("spillage share", "{:.4f}"),
-        "wall_time_s": ("wall time of a cycle [s]", "{:.1f}"),
-    }
-    table.add_column("", no_wrap=True)
-    for heading in ("mean", "standard error", "spread"):
-        table.add_column(heading, justify="right")
-    # The list of values takes what the terminal leaves, and goes on in the next line.
-    table.add_column("values", overflow="fold", ratio=1)
-    for name, (label, form) in rows.items():
-        row = summary["quantities"][name]
-        numbers = [
-            "-" if row[key] is None else form.format(row[key]) for key in ("mean", "standard_error", "spread")
-        ]
-        values = "  ".join("-" if value is None else form.format(value) for value in row["values"])
-        table.add_row(Text(label), *numbers, values)  # text, not markup: the units' brackets stay
-    output.print(table)
-    spread = summary["payload_spread_percent"]
-    if spread is not None:
-        output.print(f"payload spread: {spread:.1f} % of the mean load")
-    events = ", ".join(f"{name} {count}" for name, count in summary["events"].items()) or "none"
-    output.print(f"events: {events}", soft_wrap=True)
-
-
-def _kilo(value: float | None) -> float | None:
-    return None if value is None else value / 1e3
-
-
-def _print_table(title: str, rows: dict[str, Any]) -> None:
-    table = Table(title=title, show_header=False, title_justify="left")
-    table.add_column(style="bold")
-    table.add_column()
-    for key, value in rows.items():
-        shown = f"{value:.4g}" if isinstance(value, float) else str(value)
-        table.add_row(key.replace("_", " "), shown)
-    output.print(table)
-
-
-def _print_paths(paths: list[Path]) -> None:
-    for path in paths:
-        output.print(Text(f"wrote {path}"), soft_wrap=True)

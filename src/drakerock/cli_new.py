@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.text import Text
+
+from drakerock import terminal
 
 new_app = typer.Typer(
     no_args_is_help=True,
+    rich_markup_mode=None,
     help="A commented machine, site, study or controller of your own, in any folder; it runs as it is.",
 )
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Where to write; made if missing.")]
@@ -73,11 +74,10 @@ def new_controller(folder: Folder) -> None:
 
 
 def _tell(paths: list[Path], following: str) -> None:
-    output = Console()
     meshes = [path for path in paths if path.suffix == ".obj"]
     for path in paths:
         if path not in meshes:
-            output.print(Text(f"wrote {path}"), soft_wrap=True)
+            terminal.print_line(f"wrote {path}")
     if meshes:
-        output.print(f"wrote {len(meshes)} meshes beside it", soft_wrap=True)
-    output.print(Text(f"next: {following}"), soft_wrap=True)
+        terminal.print_line(f"wrote {len(meshes)} meshes beside it")
+    terminal.print_line(f"next: {following}")

@@ -20,7 +20,7 @@ from drakerock.rocks.site import make_site, make_surroundings
 from drakerock.rocks.state import make_empty_pile
 
 scenario = Scenario.model_validate({"site": {"void_depth": 3.0, "rear_layer": 0.0}})
-shapes = load_rock_shapes(scenario.rocks.shapes)
+shapes = load_rock_shapes(scenario.rocks)
 rng = np.random.default_rng(1)
 waiting = sample_rocks(60, scenario.rocks, shapes, rng)
 pile, _ = place_rocks(waiting, make_empty_pile(), shapes, make_emitter(scenario.site, scenario.pile), rng)

@@ -93,5 +93,5 @@ def test_a_failed_loading_is_the_last(scenario, tmp_path):
 def test_what_the_bucket_took_is_cleared_away_though_it_spilled(straight):
     folder, _ = straight
     pile = load_pile(folder / "loading_00" / "pile_next.npz")
-    loose = find_loose(pile, load_rock_shapes(RocksConfig().shapes), 0.005)
+    loose = find_loose(pile, load_rock_shapes(RocksConfig()), 0.005)
     assert not np.any(loose & (pile.p_WRs[:, 0] < -4.0))

@@ -141,7 +141,7 @@ def jammed():
         size=rng.choice([0.6, 0.8], n),
         quaternions=[draw_quaternion(rng) for _ in range(n)],
     )
-    engine = make_engine(pile, load_rock_shapes(RocksConfig().shapes), make_site(site))
+    engine = make_engine(pile, load_rock_shapes(RocksConfig()), make_site(site))
     arrays, _ = run(engine, engine.make_arrays(pile), 4.0)
     return engine.make_pile(arrays), site
 
@@ -237,9 +237,11 @@ def test_a_restored_context_repeats_bit_for_bit(jammed):
 
 
 def _get_state(scene, root):
-    context = scene.rocks.GetMyContextFromRoot(root)
-    values = [
-        context.get_discrete_state(k).value().copy() for k in range(context.num_discrete_state_groups())
-    ]
+    pile = scene.rocks.get_pile(root)
+    assert pile.contacts is not None
     plant = scene.plant.GetMyContextFromRoot(root)
-    return [*values, scene.plant.GetPositionsAndVelocities(plant).copy()]
+    return [
+        *(getattr(pile, name) for name in ("p_WRs", "q_WRs", "V_WRs")),
+        *(getattr(pile.contacts, name) for name in ("pairs", "points", "impulses", "resting")),
+        scene.plant.GetPositionsAndVelocities(plant).copy(),
+    ]

@@ -69,6 +69,6 @@ def read_height_field(scenario: Scenario, source: Path | None = None) -> HeightF
     if source is not None and source.suffix != ".npz":
         raise InputError(f"{source}: a pile (.npz) or a plan (.json)")
     pile = fetch_pile(make_recipe(scenario))[0] if source is None else load_pile(source)
-    shapes = load_rock_shapes(scenario.rocks.shapes, scenario.rocks.max_corners)
+    shapes = load_rock_shapes(scenario.rocks)
     cell, length = scenario.loading.sensing.cell, scenario.site.drift_length / 2
     return calc_height_field(pile, shapes, scenario.site, cell, length)

@@ -123,15 +123,17 @@ class Recorder:
         self._bodies.append(np.array([_to_vector(body_poses[int(index)]) for index in self._indices]))
         poses = np.hstack([pile.q_WRs, pile.p_WRs])
         if self._first is None:
-            self._first = self._last = poses
+            self._first, self._last = poses, poses.copy()
             return
+        # Most rocks lie where they lay.
+        rocks = np.flatnonzero((poses != self._last).any(axis=1))
+        change = poses[rocks] - self._last[rocks]
         # A turn of the quaternion by d moves the rock's surface by about 2 d times its radius.
-        turned = 2.0 * self._reach * np.linalg.norm(poses[:, :4] - self._last[:, :4], axis=1)
-        shifted = np.linalg.norm(poses[:, 4:] - self._last[:, 4:], axis=1)
-        moved = np.flatnonzero(turned + shifted > self._threshold)
+        turned = 2.0 * self._reach[rocks] * np.linalg.norm(change[:, :4], axis=1)
+        shifted = np.linalg.norm(change[:, 4:], axis=1)
+        moved = rocks[turned + shifted > self._threshold]
         if len(moved):
             self._moves.append((len(self._times) - 1, moved, poses[moved]))
-            self._last = self._last.copy()
             self._last[moved] = poses[moved]
 
     def finish(self, notes: dict[str, Any]) -> Recording:
@@ -154,8 +156,8 @@ class Recorder:
             rock_size=self._pile.size,
             rock_fixed=self._pile.fixed,
             X_WRs=self._first,
-            move_frame=np.array([f for f, r, _ in moves for _ in r], np.int32),
-            move_rock=np.array([k for _, r, _ in moves for k in r], np.int32),
+            move_frame=np.repeat([f for f, _, _ in moves], [len(r) for _, r, _ in moves]).astype(np.int32),
+            move_rock=np.concatenate([r for _, r, _ in moves] or [np.zeros(0, np.int64)]).astype(np.int32),
             move_pose=np.concatenate([p for _, _, p in moves] or [np.zeros((0, 7))]).astype(np.float32),
             site=self._site,
             notes=notes,

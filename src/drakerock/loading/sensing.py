@@ -11,7 +11,6 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, LeafSystem
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-from scipy.stats import binned_statistic_2d
 
 from drakerock.errors import InputError
 from drakerock.loading.config import ScannerConfig, SensingConfig
@@ -129,6 +128,8 @@ def estimate_height_field(points: Array, site: SiteConfig, cell: float, length: 
     covered = np.all((points[:, :2] >= low) & (points[:, :2] <= high), axis=1)
     if np.any(covered):
         inside = points[covered]
+        from scipy.stats import binned_statistic_2d  # takes long to import, and only scans need it
+
         h = binned_statistic_2d(*inside.T, "median", bins=edges).statistic
         seen = np.isfinite(h)
         grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)

@@ -143,7 +143,7 @@ def make_next_pile(scenario: Scenario, result: CycleResult, number: int) -> Pile
         return result.pile_before
     removed = result.in_bucket | result.debris
     rng = make_generator(scenario.seed, "refill", number)
-    shapes = load_rock_shapes(scenario.rocks.shapes, scenario.rocks.max_corners)
+    shapes = load_rock_shapes(scenario.rocks)
     following = refill(result.pile_after, removed, shapes, make_recipe(scenario), rng)
     if not np.all(np.isfinite(following.p_WRs)):
         raise SimulationFailure(f"the refill after loading {number} is not finite")

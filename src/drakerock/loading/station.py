@@ -153,7 +153,7 @@ def make_station(
     plant, scene_graph = add_plant(builder, dynamics)
     AddDrift(plant, site, dynamics.plant)
     machine = add_machine(plant, scenario.machine)
-    shapes = load_rock_shapes(scenario.rocks.shapes, scenario.rocks.max_corners)
+    shapes = load_rock_shapes(scenario.rocks)
     bodies = None
     if dynamics.rocks == "plant":
         bodies = AddRockBodies(

@@ -18,7 +18,7 @@ from scipy.spatial.distance import pdist
 
 from drakerock.errors import InputError
 from drakerock.resources import find_file
-from drakerock.rocks.config import MAX_CORNERS
+from drakerock.rocks.config import RocksConfig
 
 Array = NDArray[np.float64]
 
@@ -183,16 +183,21 @@ def make_rock_shape(name: str, points: Array) -> RockShape:
     )
 
 
-@lru_cache(maxsize=8)
-def load_rock_shapes(uris: tuple[str, ...], max_corners: int = MAX_CORNERS) -> tuple[RockShape, ...]:
-    """Read convex shapes from mesh files (``package://drakerock/...`` or paths), one rock each, in any unit.
+def load_rock_shapes(rocks: RocksConfig) -> tuple[RockShape, ...]:
+    """Read the convex shapes of the rocks from mesh files, `rocks.shapes`, one rock each, in any unit.
 
     The hull is taken, and what that changes is said as a warning of this module's logger: holes, hollows, corners
-    beyond `max_corners`.
+    beyond `rocks.max_corners`.
 
     Raises:
         InputError: a file is missing, or holds no mesh with a volume, several bodies, or a plate.
     """
+    return load_convex_meshes(rocks.shapes, rocks.max_corners)
+
+
+@lru_cache(maxsize=8)
+def load_convex_meshes(uris: tuple[str, ...], max_corners: int) -> tuple[RockShape, ...]:
+    """Read what `load_rock_shapes` says; kept, since many parts of a simulation ask for the same shapes."""
     return tuple(_load_rock_shape(uri, max_corners) for uri in uris)
 
 

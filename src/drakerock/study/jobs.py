@@ -1,4 +1,7 @@
-"""Single jobs: a scenario in; a folder with a pile, or with one loading cycle, out."""
+"""Single jobs: a scenario in; a folder with a pile, or with one loading cycle, out.
+
+What draws pictures is imported by those that do: it takes longer to import than Drake.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +22,7 @@ from drakerock.loading.mining import MINING
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario, make_recipe
 from drakerock.loading.sequence import run_sequence
+from drakerock.memory import freeze_imports
 from drakerock.rocks.making.cache import fetch_pile
 from drakerock.rocks.making.settle import calc_creep
 from drakerock.rocks.shapes import load_rock_shapes
@@ -26,9 +30,6 @@ from drakerock.rocks.site import make_site
 from drakerock.rocks.state import PileState, save_pile
 from drakerock.rocks.summary import calc_summary
 from drakerock.study.replays import update_replay
-from drakerock.viewing.cycle_figures import write_cycle_figures
-from drakerock.viewing.pile_figures import write_pile_picture
-from drakerock.viewing.pile_page import write_pile_page
 from drakerock.viewing.replay import write_replay
 
 # Woken rocks of a pile at rest creep no faster: 30 mm in 5 s [m/s].
@@ -69,6 +70,7 @@ def run_and_save(
         SimulationFailure: the pile could not be made.
     """
     make_folder(folder)
+    freeze_imports()
     pile = get_pile(scenario, progress)
     station = make_live_station(scenario, pile, meshcat) if meshcat else None
     result = run_cycle(
@@ -83,6 +85,8 @@ def run_and_save(
         if replay:
             paths.append(write_replay(folder))
         if figures:
+            from drakerock.viewing.cycle_figures import write_cycle_figures
+
             progress("drawing", None)
             paths += write_cycle_figures(folder)
     return result.outcome, paths
@@ -126,8 +130,11 @@ def run_and_save_sequence(
         if replay:
             update_replay(place, n_loadings)
         if figures:
+            from drakerock.viewing.cycle_figures import write_cycle_figures
+
             write_cycle_figures(place)
 
+    freeze_imports()
     outcomes = run_sequence(scenario, n_loadings, folder, progress=tell, finished=show)
     places = [folder / f"loading_{number:02d}" for number in range(len(outcomes))]
     summary = calc_sequence_summary(outcomes)
@@ -188,10 +195,13 @@ def make_pile_files(
         InputError: bad configuration, or the folder cannot be written.
         SimulationFailure: the pile could not be made.
     """
+    from drakerock.viewing.pile_figures import write_pile_picture
+    from drakerock.viewing.pile_page import write_pile_page
+
     make_folder(folder)
     recipe = make_recipe(scenario)
     pile, source = fetch_pile(recipe, progress)
-    shapes = load_rock_shapes(scenario.rocks.shapes, scenario.rocks.max_corners)
+    shapes = load_rock_shapes(scenario.rocks)
     progress("measuring", None)
     site = make_site(scenario.site)
     moved = calc_creep(pile, shapes, recipe, scenario.pile.settle_window)

@@ -72,7 +72,7 @@ def test_300_woken_rocks_stay_where_they_are(pile, centre):
     start = replace(pile, contacts=replace(pile.contacts, resting=resting))
     # Without the rest rule, so that they stay awake for all of the time.
     recipe = RECIPE.replace(**{"dynamics.nonsmooth.rest.time": 1e9})
-    after, _ = settle(start, load_rock_shapes(RECIPE.rocks.shapes), recipe, 5.0)
+    after, _ = settle(start, load_rock_shapes(RECIPE.rocks), recipe, 5.0)
     moved = np.linalg.norm(after.p_WRs - pile.p_WRs, axis=1)[woken]
     assert moved.mean() < 0.005
     assert np.percentile(moved, 99) < 0.030

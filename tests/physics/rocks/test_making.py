@@ -67,13 +67,13 @@ def test_static_rocks_cover_the_rear_wall_only(pile, recipe):
 
 def test_all_rocks_are_inside_the_site_and_none_is_loose(pile, recipe, tmp_path):
     check_pile(pile, recipe, tmp_path)
-    shapes = load_rock_shapes(recipe.rocks.shapes)
+    shapes = load_rock_shapes(recipe.rocks)
     loose = find_loose(pile, shapes, recipe.pile.contact_gap) & ~pile.fixed
     assert not loose.any()
 
 
 def test_made_pile_rests_and_carries_its_weight(pile, recipe):
-    shapes = load_rock_shapes(recipe.rocks.shapes)
+    shapes = load_rock_shapes(recipe.rocks)
     support = calc_support(pile, shapes, recipe.rocks, make_site(recipe.site), recipe.dynamics.time_step)
     total = support.floor + support.walls + support.static
     assert total == pytest.approx(support.weight, rel=0.02)
@@ -96,14 +96,14 @@ def test_same_recipe_same_bits_made_or_from_the_cache(pile, recipe, tmp_path, mo
     assert cached.provenance["seed"] == 3
     assert set(cached.provenance["versions"]) == {"results", "drakerock", "drake", "numba", "numpy"}
     # A stored pile goes on as one that never was.
-    shapes = load_rock_shapes(recipe.rocks.shapes)
+    shapes = load_rock_shapes(recipe.rocks)
     one, _ = settle(pile, shapes, recipe, 0.3)
     two, _ = settle(cached, shapes, recipe, 0.3)
     assert np.array_equal(one.p_WRs, two.p_WRs)
 
 
 def test_refill_restores_the_level(pile, recipe):
-    shapes = load_rock_shapes(recipe.rocks.shapes)
+    shapes = load_rock_shapes(recipe.rocks)
     emitter = make_emitter(recipe.site, recipe.pile)
     # The void's upper half is taken out, as if the pile had slid.
     removed = ~pile.fixed & (pile.p_WRs[:, 0] > 0) & (pile.p_WRs[:, 2] > 2.0)
@@ -121,7 +121,7 @@ def test_refill_restores_the_level(pile, recipe):
 
 
 def test_refill_of_a_full_void_adds_hardly_any(pile, recipe):
-    shapes = load_rock_shapes(recipe.rocks.shapes)
+    shapes = load_rock_shapes(recipe.rocks)
     after = refill(pile, np.zeros(len(pile), bool), shapes, recipe, np.random.default_rng(1))
     assert len(after) - len(pile) < 0.1 * len(pile)
 
@@ -129,7 +129,7 @@ def test_refill_of_a_full_void_adds_hardly_any(pile, recipe):
 def test_refill_of_a_counted_pile_keeps_its_rocks():
     recipe = make_small_recipe(pile={"rocks": 40}, site={"rear_layer": 0.0})
     pile = make_pile(recipe)
-    shapes = load_rock_shapes(recipe.rocks.shapes)
+    shapes = load_rock_shapes(recipe.rocks)
     after = refill(pile, np.arange(len(pile)) % 4 == 0, shapes, recipe, np.random.default_rng(1))
     assert np.array_equal(np.sort(after.size), np.sort(pile.size))
     assert np.array_equal(np.bincount(after.shape), np.bincount(pile.shape))
@@ -143,7 +143,7 @@ def test_rocks_without_room_wait_for_the_next_refill_and_hold_up_no_other():
     recipe = make_small_recipe(
         site=site, rocks={"gradation": [{"size_m": 0.3, "mass_fraction": 1.0}]}, pile={"rocks": 30}
     )
-    shapes = load_rock_shapes(recipe.rocks.shapes)
+    shapes = load_rock_shapes(recipe.rocks)
     small = make_pile(recipe)
     large = sample_rocks(6, recipe.rocks, shapes, np.random.default_rng(0))
     large = replace(large, size=np.full(6, 0.8), p_WRs=large.p_WRs - [20.0, 0.0, 0.0])
@@ -181,7 +181,7 @@ def test_rocks_that_never_find_room_are_a_clear_error():
 def test_fast_rocks_stay_inside(recipe):
     """Rocks at 20 m/s, faster than any fall from the emitter, in all directions at walls, floor and roof."""
     rng = np.random.default_rng(2)
-    shapes = load_rock_shapes(recipe.rocks.shapes)
+    shapes = load_rock_shapes(recipe.rocks)
     n = 80
     direction = rng.normal(size=(n, 3))
     direction *= 20.0 / np.linalg.norm(direction, axis=1)[:, None]

@@ -37,7 +37,7 @@ def test_mass_shares_meet_the_gradation_within_sampling_error(shapes):
 @given(seed=st.integers(0, 2**31))
 def test_placed_rocks_are_apart_inside_and_falling(seed):
     rocks = RocksConfig()
-    shapes = load_rock_shapes(rocks.shapes)
+    shapes = load_rock_shapes(rocks)
     rng = np.random.default_rng(seed)
     emitter = Emitter(np.array([-2.0, -1.5, 2.0]), np.array([1.0, 1.5, 6.0]), 0.5)
     there, _ = place_rocks(sample_rocks(4, rocks, shapes, rng), make_empty_pile(), shapes, emitter, rng)

@@ -21,6 +21,7 @@ from drakerock.rocks.shapes import (
     calc_height,
     calc_sieve_width,
     choose_corners,
+    load_convex_meshes,
     load_rock_shapes,
 )
 
@@ -28,7 +29,7 @@ from drakerock.rocks.shapes import (
 @pytest.fixture(autouse=True)
 def warnings_are_seen(caplog):
     caplog.set_level(logging.WARNING, logger="drakerock.rocks.shapes")
-    load_rock_shapes.cache_clear()
+    load_convex_meshes.cache_clear()
 
 
 @pytest.fixture
@@ -37,7 +38,7 @@ def load(tmp_path):
 
     def run(mesh, name="rock.obj", **options):
         mesh.export(tmp_path / name)
-        return load_rock_shapes((str(tmp_path / name),), **options)[0]
+        return load_rock_shapes(RocksConfig(shapes=(str(tmp_path / name),), **options))[0]
 
     return run
 
@@ -71,7 +72,7 @@ def test_vertices_that_no_face_uses_do_not_count(tmp_path):
     mesh = trimesh.creation.box((1, 1, 1))
     text = mesh.export(file_type="obj") + "\nv 50 0 0\n"
     (tmp_path / "stray.obj").write_text(text)
-    assert load_rock_shapes((str(tmp_path / "stray.obj"),))[0].radius < 2.0
+    assert load_rock_shapes(RocksConfig(shapes=(str(tmp_path / "stray.obj"),)))[0].radius < 2.0
 
 
 @pytest.mark.parametrize("thickness", [0.001, 0.1])
@@ -150,8 +151,8 @@ def test_chosen_corners_span_a_hull_inside_that_comes_closer_with_each(seed, n, 
 
 
 def test_shipped_shapes_are_below_the_limit(shapes, caplog):
-    load_rock_shapes.cache_clear()
-    for first, second in zip(shapes, load_rock_shapes(RocksConfig().shapes), strict=True):
+    load_convex_meshes.cache_clear()
+    for first, second in zip(shapes, load_rock_shapes(RocksConfig()), strict=True):
         np.testing.assert_array_equal(first.vertices, second.vertices)
     assert not read(caplog)
 

@@ -6,6 +6,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from drakerock.errors import InputError
+from drakerock.rocks.config import RocksConfig
 from drakerock.rocks.shapes import calc_sieve_width, load_rock_shapes, make_rock_shape, sample_rock_points
 
 
@@ -64,7 +65,7 @@ def test_flat_points_and_missing_mesh_are_refused(tmp_path):
     with pytest.raises(ValueError, match="no volume"):
         make_rock_shape("flat", np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1e-12]], float))
     with pytest.raises(InputError, match="no such mesh file"):
-        load_rock_shapes(("package://drakerock/rocks/nothing.obj",))
+        load_rock_shapes(RocksConfig(shapes=("package://drakerock/rocks/nothing.obj",)))
     (tmp_path / "bad.obj").write_text("this is no mesh")
     with pytest.raises(InputError, match=r"rocks.shapes: .*bad.obj"):
-        load_rock_shapes((str(tmp_path / "bad.obj"),))
+        load_rock_shapes(RocksConfig(shapes=(str(tmp_path / "bad.obj"),)))

@@ -102,7 +102,7 @@ def AddRocks(
     if not gravity.any():
         # Rocks that float rest on nothing: one asleep would take a blow like a wall.
         settings = settings.replace(reduction="none")
-    shapes = shapes or load_rock_shapes(config.shapes, config.max_corners)
+    shapes = shapes or load_rock_shapes(config)
     solver = NonsmoothEngine(
         config, shapes, geometry.surroundings, settings, plant.time_step(), pile.shape, pile.size, pile.fixed,
         geometry.pieces, len(geometry.bodies), gravity,

@@ -85,7 +85,7 @@ def AddRockBodies(
     if plant.is_finalized():
         raise InputError("AddRockBodies: the plant is finalized; add rocks as bodies before Finalize()")
     rocks, config = rocks or RocksConfig(), config or PlantEngineConfig()
-    shapes = shapes or load_rock_shapes(rocks.shapes, rocks.max_corners)
+    shapes = shapes or load_rock_shapes(rocks)
     # Its contacts are then those of the step that begins.
     plant.SetUseSampledOutputPorts(False)
     instance = plant.AddModelInstance("rocks")

@@ -108,15 +108,11 @@ class PlantView(LeafSystem):
         self._wake_boxes = [
             (self._number[int(box.body)], np.concatenate([box.lower, box.upper])) for box in wake_boxes
         ]
-        self._loop_points = [
-            (body.index(), p)
-            for loop in _find_loops(plant)
-            for body, p in ((loop.body_A, loop.p_AP), (loop.body_B, loop.p_BQ))
-        ]
+        self._loops = _group_loop_points(_find_loops(plant))
         self._materials: dict[int, tuple[int | None, Material]] = {}
         self._motors = _find_motors(plant)
         self._stops = _find_stops(plant)
-        self._damping = _find_damping(plant)
+        self._damping = plant.time_step() * np.diag(_find_damping(plant))
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         self._query = self.DeclareAbstractInputPort("geometry_query", Value(QueryObject()))
         self._actuation = self._declare(plant.get_actuation_input_port())
@@ -156,10 +152,10 @@ class PlantView(LeafSystem):
             # Neither Drake's proximity engine nor the search for rocks survives such poses.
             raise SimulationFailure(f"{self._find_lost_body(state)}: its position or velocity is not finite")
         plant.SetPositionsAndVelocities(scratch, state)
-        v, positions = plant.GetVelocities(scratch), plant.GetPositions(scratch)
+        v, positions = plant.GetVelocities(scratch), plant.GetPositions(scratch).tolist()
         generalised, joints = self._calc_own_forces(context, scratch, positions, h)
         inverse, free_change = calc_free_motion(
-            np.ascontiguousarray(plant.CalcMassMatrix(scratch) + h * np.diag(self._damping)),
+            np.ascontiguousarray(plant.CalcMassMatrix(scratch) + self._damping),
             h * generalised,
             v,
             self._calc_loop_rows(scratch, len(v)),
@@ -204,7 +200,7 @@ class PlantView(LeafSystem):
         return "the plant"
 
     def _calc_own_forces(
-        self, context: Context, scratch: Context, positions: Array, h: float
+        self, context: Context, scratch: Context, positions: list[float], h: float
     ) -> tuple[Array, list[list[float]]]:
         """Return all generalised forces (v,) but those of rocks and rows, and the laws of motors and stops."""
         plant = self._plant
@@ -217,29 +213,25 @@ class PlantView(LeafSystem):
         if self._spatial.HasValue(context):
             for force in self._spatial.Eval(context):
                 generalised = generalised + self._calc_applied(scratch, force)
-        feedforward = self._read_actuation(context)
+        whole = _read(self._actuation, context)
+        told = {
+            instance: (_read(actuation, context), _read(desired, context))
+            for instance, (actuation, desired) in self._instances.items()
+        }
         laws = []
-        for motor, effort in zip(self._motors, feedforward, strict=True):
-            desired = self._instances[motor.instance][1]
-            if motor.gain(h) == 0.0 or not desired.HasValue(context):
+        for motor in self._motors:
+            own, desired = told[motor.instance]
+            effort = whole[motor.place_in_plant] if whole else 0.0
+            if own:
+                effort += own[motor.place]
+            gain, limit = motor.gain(h), h * motor.effort
+            if gain == 0.0 or not desired:
                 generalised[motor.velocity_start] += np.clip(effort, -motor.effort, motor.effort)
                 continue
-            q, v = desired.Eval(context).reshape(2, -1)[:, motor.place]
+            q, v = desired[motor.place], desired[len(desired) // 2 + motor.place]
             pull = motor.d * v + motor.p * (q - positions[motor.position_start]) + effort
-            gain, limit = motor.gain(h), h * motor.effort
             laws.append([motor.velocity_start, 1.0, pull / gain, 1.0 / (h * gain), -limit, limit])
         return generalised, laws + self._find_stop_laws(positions, h)
-
-    def _read_actuation(self, context: Context) -> list[float]:
-        whole = self._actuation.Eval(context) if self._actuation.HasValue(context) else None
-        efforts = []
-        for motor in self._motors:
-            own = self._instances[motor.instance][0]
-            effort = 0.0 if whole is None else float(whole[motor.place_in_plant])
-            if own.HasValue(context):
-                effort += float(own.Eval(context)[motor.place])
-            efforts.append(effort)
-        return efforts
 
     def _calc_applied(self, scratch: Context, force: ExternallyAppliedSpatialForce) -> Array:
         world = self._plant.world_frame()
@@ -253,19 +245,15 @@ class PlantView(LeafSystem):
 
     def _calc_loop_rows(self, scratch: Context, n_v: int) -> Array:
         """Return what the velocities (v,) must not change: the distance of the two points of each loop, (3 l, v)."""
-        plant = self._plant
-        world = plant.world_frame()
-        points = np.array(
-            [
-                plant.CalcJacobianTranslationalVelocity(
-                    scratch, JacobianWrtVariable.kV, plant.get_body(body).body_frame(), p, world, world
-                )
-                for body, p in self._loop_points
-            ]
-        ).reshape(-1, 2, 3, n_v)
-        return np.asarray(points[:, 0] - points[:, 1]).reshape(-1, n_v)
+        plant, world = self._plant, self._plant.world_frame()
+        points = np.zeros((sum(len(places) for _, _, places in self._loops), 3, n_v))
+        for body, p_BPs, places in self._loops:
+            points[places] = plant.CalcJacobianTranslationalVelocity(
+                scratch, JacobianWrtVariable.kV, plant.get_body(body).body_frame(), p_BPs, world, world
+            ).reshape(-1, 3, n_v)
+        return np.asarray(points[::2] - points[1::2]).reshape(-1, n_v)
 
-    def _find_stop_laws(self, positions: Array, h: float) -> list[list[float]]:
+    def _find_stop_laws(self, positions: list[float], h: float) -> list[list[float]]:
         """Return a law per joint stop that is near, see `machine_step`."""
         laws = []
         for stop in self._stops:
@@ -354,6 +342,24 @@ def _find_loops(plant: MultibodyPlant) -> tuple[BallConstraint, ...]:
     except InputError as error:
         _log.warning("%s: rocks meet the plant's bodies as if its constraints were not there", error)
         return ()
+
+
+def _group_loop_points(
+    loops: Sequence[BallConstraint],
+) -> list[tuple[BodyIndex, Array, list[int]]]:
+    """Return a body each, the loops' points (3, k) on it in its frame [m], and their places: 2 l, 2 l + 1 of loop l."""
+    points = [
+        (body.index(), p)
+        for loop in loops
+        for body, p in ((loop.body_A, loop.p_AP), (loop.body_B, loop.p_BQ))
+    ]
+    places = {body: [place for place, (other, _) in enumerate(points) if other == body] for body, _ in points}
+    return [(body, np.stack([points[k][1] for k in of], axis=1), of) for body, of in places.items()]
+
+
+def _read(port: InputPort, context: Context) -> list[float]:
+    """Return what is connected to a port, [] if nothing is."""
+    return port.Eval(context).tolist() if port.HasValue(context) else []
 
 
 def _find_motors(plant: MultibodyPlant) -> Sequence[_Motor]:

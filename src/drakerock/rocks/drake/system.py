@@ -5,7 +5,7 @@ The system holds no physics of its own: its state is the engine's arrays, its up
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from drakerock.errors import InputError
 from drakerock.memory import weak
 from drakerock.rocks.drake.geometry import PlantGeometry
 from drakerock.rocks.drake.interface import ROCK_SUMMARY, RockContacts, RockSystem, make_empty_contacts
-from drakerock.rocks.engine.contact_cache import ContactCache, make_contact_cache
+from drakerock.rocks.drake.states import RockStates, SolvedState
 from drakerock.rocks.engine.engine import (
     MachineStep,
     NonsmoothEngine,
@@ -34,7 +34,6 @@ from drakerock.rocks.engine.engine import (
     StepReport,
     make_machineless_step,
 )
-from drakerock.rocks.engine.records import CACHED_POINT, SLEEP
 from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.state import PileState
 
@@ -45,22 +44,13 @@ START_PENETRATION = 0.05
 START_SHARE = 1 / 6
 
 
-@dataclass(frozen=True, eq=False)
-class _Step:
-    """The solution of one step: the state after it, the report, and the room that the state is in."""
-
-    arrays: RockArrays
-    report: StepReport | None
-    room: RockArrays
-
-
 class NonsmoothRocks(RockSystem):
     """All rocks of a pile, stepped by the nonsmooth engine.
 
     One solve per step: a cache entry computed from the state at t_n, read by the discrete update and by
-    ``applied_spatial_force`` alike. All state is discrete and numeric, the contact cache and the bookkeeping of
-    sleeping rocks included, so a context can be saved, restored and repeated bit for bit. The engine's scratch memory
-    is shared by all contexts: one thread at a time.
+    ``applied_spatial_force`` alike. All state is in the context (`RockStates`), the contact cache and the bookkeeping
+    of sleeping rocks included, so a context can be saved, restored and repeated bit for bit; the whole context, not its
+    discrete values alone. The engine's scratch memory is shared by all contexts: one thread at a time.
 
     When a Diagram is initialised, a body of the plant that starts inside the pile is an InputError.
 
@@ -96,27 +86,23 @@ class NonsmoothRocks(RockSystem):
         super().__init__(plant, pile, shapes, geometry.bodies)
         self._engine = engine
         self._provenance = dict(pile.provenance)
-        n = engine.n_rocks
-        n_bodies = len(geometry.bodies)
-        values = self._flatten(engine.make_arrays(pile))
-        # Room for more points than there are: `counts` tells how many points of the cache count, and the like.
-        for name, flat in _flatten_cache(make_contact_cache(engine.capacity)).items():
-            values[name] = np.pad(values[name], (0, len(flat) - len(values[name])))
-        values["report"] = np.zeros(len(ROCK_SUMMARY) + 6 * n_bodies)
-        self._groups = {name: self.DeclareDiscreteState(flat) for name, flat in values.items()}
+        self._states = self.DeclareAbstractState(Value[object](self._make_states(pile)))
+        # The state's number, and what the step that led to it told.
+        self._number = self.DeclareDiscreteState(1)
+        self._report = self.DeclareDiscreteState(np.zeros(len(ROCK_SUMMARY) + 6 * len(geometry.bodies)))
         self._plant_step = self.DeclareAbstractInputPort("plant_step", Value[object](make_machineless_step()))
         self._others = self.DeclareAbstractInputPort(
             "applied_spatial_force", Value[list[ExternallyAppliedSpatialForce]]([])
         )
         step = self.DeclareCacheEntry(
             "step",
-            ValueProducer(allocate=weak(self._make_step), calc=weak(self._calc_step)),
-            {self.xd_ticket(), self._plant_step.ticket()},
+            ValueProducer(allocate=lambda: Value[object](()), calc=weak(self._calc_step)),
+            {self.all_state_ticket(), self._plant_step.ticket()},
         )
         self._step = step.cache_index()
-        state = self.xd_ticket()
-        self._declare_outputs(self.discrete_state_ticket(self._groups["report"]), state)
-        self.DeclareVectorOutputPort("status", n, self._calc_status, {state})
+        state = self.all_state_ticket()
+        self._declare_outputs(self.discrete_state_ticket(self._report), state)
+        self.DeclareVectorOutputPort("status", engine.n_rocks, self._calc_status, {state})
         self.DeclareAbstractOutputPort(
             "contacts",
             lambda: Value[object](make_empty_contacts()),
@@ -159,10 +145,9 @@ class NonsmoothRocks(RockSystem):
             ValueError: not the rocks this system was made for.
         """
         context = self.GetMyMutableContextFromRoot(root_context)
-        discrete = context.get_mutable_discrete_state()
-        for name, flat in self._flatten(self._engine.make_arrays(pile)).items():
-            discrete.get_mutable_value(self._groups[name])[: len(flat)] = flat
-        discrete.get_mutable_value(self._groups["report"])[:] = 0.0
+        context.SetAbstractState(self._states, self._make_states(pile))
+        for group in (self._number, self._report):
+            context.get_mutable_discrete_state(group).SetZero()
 
     def get_pile(self, root_context: Context) -> PileState:
         """Read the rocks' present state, contacts included, from the Diagram's context."""
@@ -171,39 +156,21 @@ class NonsmoothRocks(RockSystem):
 
     def get_report(self, root_context: Context) -> StepReport:
         """Return the report of the step that starts at the Diagram's context (solved if it is not yet)."""
-        return self._solve(self.GetMyContextFromRoot(root_context))[1]
+        report = self._solve(self.GetMyContextFromRoot(root_context)).report
+        assert report is not None
+        return report
+
+    def _make_states(self, pile: PileState) -> RockStates:
+        return RockStates(self._engine, SolvedState(self._engine.make_arrays(pile)))
+
+    def _get_states(self, context: Context) -> tuple[RockStates, int]:
+        """Return the context's states, and the number of the one that counts."""
+        states = context.get_abstract_state().get_value(self._states).get_value()
+        return states, int(context.get_discrete_state(self._number)[0])
 
     def _get_arrays(self, context: Context) -> RockArrays:
-        discrete = context.get_discrete_state()
-        n_points, n_sleeping, steps = discrete.value(self._groups["counts"]).reshape(-1)
-        arrays = self._view({name: discrete.value(group).reshape(-1) for name, group in self._groups.items()})
-        cache = arrays.cache.select(slice(int(n_points)))
-        return replace(arrays, cache=cache, n_sleeping=int(n_sleeping), steps=int(steps))
-
-    def _view(self, state: dict[str, Array]) -> RockArrays:
-        """Return arrays that are in the state's, the cache with its full capacity, without the counts."""
-        n = self._engine.n_rocks
-        return RockArrays(
-            state["quaternions"].reshape(n, 4),
-            state["positions"].reshape(n, 3),
-            state["velocities"].reshape(n, 6),
-            state["sleep"].view(SLEEP),
-            ContactCache(state["pairs"].view(np.int32).reshape(-1, 2), state["points"].view(CACHED_POINT)),
-        )
-
-    def _flatten(self, arrays: RockArrays) -> dict[str, Array]:
-        return {
-            "quaternions": arrays.quaternions.reshape(-1),
-            "positions": arrays.positions.reshape(-1),
-            "velocities": arrays.velocities.reshape(-1),
-            "sleep": arrays.sleep.view(float),
-            **_flatten_cache(arrays.cache),
-            "counts": _count(arrays),
-        }
-
-    def _make_step(self) -> Value:
-        room = self._engine.make_room()
-        return Value[object](_Step(room, None, room))
+        states, number = self._get_states(context)
+        return states.get(number).arrays
 
     def _read_plant_step(self, context: Context) -> MachineStep:
         if self._plant_step.HasValue(context):
@@ -211,20 +178,25 @@ class NonsmoothRocks(RockSystem):
         return make_machineless_step()
 
     def _calc_step(self, context: Context, value: Value) -> None:
-        room = value.get_value().room
-        plant_step = self._read_plant_step(context)
-        value.set_value(_Step(*self._engine.step(self._get_arrays(context), plant_step, room), room))
+        states, number = self._get_states(context)
+        value.set_value(states.solve_next(number, self._read_plant_step(context)))
 
-    def _solve(self, context: Context) -> tuple[RockArrays, StepReport]:
-        step: _Step = self.get_cache_entry(self._step).Eval(context)
-        assert step.report is not None
-        return step.arrays, step.report
+    def _solve(self, context: Context) -> SolvedState:
+        """Return the state after the coming step, as yet solved."""
+        following: SolvedState = self.get_cache_entry(self._step).Eval(context)
+        return following
 
     def _update_with_plant(self, context: Context, state: State) -> None:
         self._update(context, state.get_mutable_discrete_state())
+        # The state to be is a copy from before the step was solved.
+        state.get_mutable_abstract_state().get_mutable_value(self._states).SetFrom(
+            context.get_abstract_state().get_value(self._states)
+        )
 
     def _update(self, context: Context, discrete: DiscreteValues) -> None:
-        arrays, report = self._solve(context)
+        following = self._solve(context)
+        report = following.report
+        assert report is not None
         last = self._read_report(context)
         values = {
             "n_awake": report.n_awake,
@@ -236,11 +208,8 @@ class NonsmoothRocks(RockSystem):
             "n_flagged": last[_N_FLAGGED] + report.flagged,
         }
         summary = [float(values[name]) for name in ROCK_SUMMARY]
-        # What is written to begins as a copy of the state before the step.
-        state = {name: discrete.get_mutable_value(group) for name, group in self._groups.items()}
-        self._engine.write_changes(arrays, report, self._view(state))
-        state["counts"][:] = _count(arrays)
-        state["report"][:] = np.concatenate([summary, report.F_Bs_W.reshape(-1)])
+        discrete.set_value(self._number, [following.arrays.steps])
+        discrete.set_value(self._report, np.concatenate([summary, report.F_Bs_W.reshape(-1)]))
 
     def _check_start(self, context: Context) -> EventStatus:
         found = self._find_contacts(context)
@@ -251,7 +220,8 @@ class NonsmoothRocks(RockSystem):
             body = self._plant.get_body(BodyIndex(int(found.body[k])))
             raise InputError(
                 f"body '{body.scoped_name()}' starts {found.depth[k]:.2f} m inside a rock at "
-                f"{np.round(found.p_WCs[k], 2).tolist()}: place it outside the pile before the simulation starts"
+                f"{np.round(found.p_WCs[k], 2).tolist()}: place it outside the pile before the simulation starts "
+                "(in a station: station.initialize(context))"
             )
         return EventStatus.Succeeded()
 
@@ -287,7 +257,7 @@ class NonsmoothRocks(RockSystem):
         )
 
     def _read_report(self, context: Context) -> Array:
-        return np.array(context.get_discrete_state(self._groups["report"]).value())
+        return np.array(context.get_discrete_state(self._report).value())
 
     def _calc_status(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._get_arrays(context).status)
@@ -302,7 +272,8 @@ class NonsmoothRocks(RockSystem):
         return self._others.Eval(context) if self._others.HasValue(context) else []
 
     def _calc_applied_force(self, context: Context, output: Value) -> None:
-        _, report = self._solve(context)
+        report = self._solve(context).report
+        assert report is not None
         forces = []
         for index, F_B_W in zip(self._bodies, report.F_Bs_W, strict=True):
             if F_B_W.any():
@@ -316,12 +287,3 @@ class NonsmoothRocks(RockSystem):
 
 _N_LOST = list(ROCK_SUMMARY).index("n_lost")
 _N_FLAGGED = list(ROCK_SUMMARY).index("n_flagged")
-
-
-def _count(arrays: RockArrays) -> Array:
-    return np.array([len(arrays.cache.pairs), arrays.n_sleeping, arrays.steps], float)
-
-
-def _flatten_cache(cache: ContactCache) -> dict[str, Array]:
-    # Bits, two numbers in one.
-    return {"pairs": cache.pairs.reshape(-1).view(np.float64), "points": cache.points.view(np.float64)}

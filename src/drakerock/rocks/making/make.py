@@ -36,7 +36,7 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
         SimulationFailure: the dynamics failed, or the pile did not come to rest in time.
     """
     _announce_number(recipe)
-    shapes = load_rock_shapes(recipe.rocks.shapes, recipe.rocks.max_corners)
+    shapes = load_rock_shapes(recipe.rocks)
     rng = make_generator(recipe.seed, "pile")
     site, n = recipe.site, recipe.pile.rocks
     pile = make_empty_pile()
@@ -75,7 +75,7 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
 def _announce_number(recipe: PileRecipe) -> None:
     """Say how many rocks are about to be simulated; InputError if the gradation makes too many of them."""
     rocks = recipe.rocks
-    volume = calc_mean_volume(rocks, load_rock_shapes(rocks.shapes, rocks.max_corners))
+    volume = calc_mean_volume(rocks, load_rock_shapes(rocks))
     depth = recipe.site.rear_layer if recipe.pile.rocks else recipe.site.void_depth
     room = PACKING * depth * recipe.site.drift_width * recipe.pile.emission_height
     number = (recipe.pile.rocks or 0) + round(room / volume)
@@ -90,6 +90,6 @@ def _announce_number(recipe: PileRecipe) -> None:
 
 def count_filling(recipe: PileRecipe, depth: float) -> int:
     """Return more rocks than fit under the emitter over a depth [m]: as if they filled it without gaps."""
-    shapes = load_rock_shapes(recipe.rocks.shapes, recipe.rocks.max_corners)
+    shapes = load_rock_shapes(recipe.rocks)
     room = depth * recipe.site.drift_width * (recipe.pile.emission_height + 1.0)
     return int(np.ceil(room / calc_mean_volume(recipe.rocks, shapes)))

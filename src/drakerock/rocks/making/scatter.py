@@ -40,7 +40,7 @@ def scatter_rocks(
             f"scatter_rocks: low {low.tolist()} must be below high {high.tolist()} on three axes"
         )
     config = config or RocksConfig()
-    shapes = load_rock_shapes(config.shapes, config.max_corners)
+    shapes = load_rock_shapes(config)
     waiting = sample_rocks(n, config, shapes, make_generator(seed, "scattered rocks", "kinds"))
     # The largest first, while there is room.
     order: NDArray[np.int64] = np.argsort(-waiting.size, kind="stable")

@@ -383,7 +383,7 @@ def test_history_keeps_a_pressed_rock_on_its_side_of_a_plate():
 
 def test_rounded_rocks_stay_close_to_their_hulls():
     """Core plus ball differs from the hull by less than the rounding, on all faces."""
-    for item in load_rock_shapes(RocksConfig().shapes):
+    for item in load_rock_shapes(RocksConfig()):
         shapes = make_convex_shapes([item.vertices], [0.03])
         core = get_vertices(shapes, 0)
         hull = ConvexHull(item.vertices)

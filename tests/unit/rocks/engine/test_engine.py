@@ -50,7 +50,7 @@ from rock_helpers import (
     run,
 )
 
-SHAPES = load_rock_shapes(RocksConfig().shapes)
+SHAPES = load_rock_shapes(RocksConfig())
 
 
 def draw_pile(seed, n, box=2.0, sizes=(0.3, 0.4, 0.6, 0.8)):

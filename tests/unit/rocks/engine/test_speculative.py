@@ -17,7 +17,7 @@ from drakerock.rocks.engine.vectors import rotate_rotation
 from drakerock.rocks.shapes import load_rock_shapes
 from rock_helpers import draw_quaternion, make_box, make_engine, make_pile
 
-SHAPES = load_rock_shapes(RocksConfig().shapes)
+SHAPES = load_rock_shapes(RocksConfig())
 VECTORS = st.tuples(*[st.floats(-4.0, 4.0)] * 3)
 
 
