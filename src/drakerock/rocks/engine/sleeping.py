@@ -86,8 +86,8 @@ def find_sensed(
     """Find the sleeping rocks that meet a sensor.
 
     Reads:
-        positions, radius, sensors: see `is_sensed`, (n, 3) and (n,).
-        reach: the largest radius [m].
+        positions, radius: see `is_sensed`, (n, 3), (n,).
+        reach, sensors: largest radius [m], boxes.
         blocks: of all rocks.
         sleep: (n,) records `SLEEP`.
     Writes:
