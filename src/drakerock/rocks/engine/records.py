@@ -156,8 +156,7 @@ def as_records(matrix: np.ndarray, record: np.dtype[Any]) -> np.ndarray:
 
 
 def copy_records(source: np.ndarray, target: np.ndarray, rows: NDArray[np.int64] | None = None) -> None:
-    """Copy records, or some rows of them, as numbers: where fields share their room, numpy is thirty times slower."""
-    if rows is None:
-        as_matrix(target)[:] = as_matrix(source)
-    elif len(rows):
-        as_matrix(target)[rows] = as_matrix(source)[rows]
+    """Copy records, or some rows of them, as bytes: where fields share their room, numpy is thirty times slower."""
+    record = np.dtype((np.void, source.dtype.itemsize))
+    chosen = slice(None) if rows is None else rows
+    target.view(record)[chosen] = source.view(record)[chosen]
