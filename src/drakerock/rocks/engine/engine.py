@@ -90,6 +90,8 @@ DEEP_SHARE = 0.375
 # One that would make an overlap beyond this share is solved again, with contacts where its own motion would lead.
 DEEPENED_SHARE = 0.75
 
+NOBODY: IntArray = np.zeros(0, np.int64)
+
 
 class _Attempt(NamedTuple):
     """How a step is tried: iterations, acceleration, from the last impulses or cold, whether all is searched."""
@@ -318,15 +320,20 @@ class NonsmoothEngine(RockSet):
         return result is not None and result[1].residual <= self.config.max_residual
 
     def _try_step(
-        self, arrays: RockArrays, machine: MachineStep, room: RockArrays, attempt: _Attempt
+        self,
+        arrays: RockArrays,
+        machine: MachineStep,
+        room: RockArrays,
+        attempt: _Attempt,
+        struck: IntArray = NOBODY,
     ) -> tuple[RockArrays, StepReport] | None:
-        """Return state and report of a step; None if they are not finite."""
+        """Return state and report of a step, which the rocks `struck` begin awake; None if they are not finite."""
         dt, index = self.time_step, arrays.index
         assert index is not None
         new = replace(room, steps=arrays.steps + 1)
         sensors = as_records(machine.sensors, SENSOR)
         stale = self._find_stale(arrays, index)
-        woken, touched = self._resting.wake(arrays, index, self.config, sensors, new)
+        woken, touched = self._resting.wake(arrays, index, self.config, sensors, struck, new)
         awake = np.sort(np.concatenate([index.awake, woken])) if len(woken) else index.awake
         stirred = np.concatenate([awake, touched])
 
@@ -341,6 +348,12 @@ class NonsmoothEngine(RockSet):
         # Of a state that a step has made, the points before this one are of rocks that sleep on.
         first = 0 if len(woken) or index.before is None else arrays.n_sleeping
         n_rows, cache_index = self._find_contacts(arrays, awake, first, index.n_gaps)
+        hit = self._resting.find_struck(n_rows, self.detection.rows, self._bodies, arrays, self.config)
+        if len(hit):
+            # Once more from the beginning, with these awake.
+            motion.clear_bodies(awake, self._bodies)
+            self._velocities[awake] = 0.0
+            return self._try_step(arrays, machine, room, attempt, np.concatenate([struck, hit]))
         solution = self._solve(n_rows, awake, machine, attempt)
 
         sane = motion.move(

@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drakerock.rocks.engine import sleeping
+from drakerock.rocks.engine.blows import find_struck
 from drakerock.rocks.engine.collision.blocks import Blocks
 from drakerock.rocks.engine.config import NonsmoothConfig
 from drakerock.rocks.engine.contact_cache import ContactCache
 from drakerock.rocks.engine.records import SLEEPING, copy_records
+from drakerock.rocks.engine.solve.rows import ContactRows
 from drakerock.rocks.engine.state import RockArrays, StateIndex
 
 Array = NDArray[np.float64]
@@ -52,9 +54,17 @@ class Resting:
         index: StateIndex,
         config: NonsmoothConfig,
         sensors: np.ndarray,
+        struck: IntArray,
         new: RockArrays,
     ) -> tuple[IntArray, IntArray]:
         """Write the records of sleep that the step may change to the new state, and wake rocks in it.
+
+        Args:
+            arrays, index: the state before the step.
+            config: settings.
+            sensors: records `SENSOR`.
+            struck: sleeping rocks to be woken, see `find_struck`.
+            new: written to.
 
         Returns:
             the rocks woken, and those that touch rocks that were solved and sleep on.
@@ -78,12 +88,9 @@ class Resting:
             self._mark_by_movers(
                 chosen, arrays.sleep, arrays.velocities, cache, arrays.n_sleeping, rest.mover_speed
             )
-            thresholds = sleeping.WakeThresholds(
-                rest.wake_load * self._strength * dt, rest.wake_share, rest.wake_near_movers, rest.wake_steps
-            )
             n_woken = sleeping.find_woken(
-                n_touched, touched, self._mass, cache, self._by_movers, thresholds, self._places, new.sleep,
-                self._woken,
+                n_touched, touched, self._mass, cache, self._by_movers, self._make_thresholds(config),
+                self._places, new.sleep, self._woken,
             )  # fmt: skip
         n_sensed = sleeping.find_sensed(
             arrays.positions, self._radius, self._reach, sensors, self._blocks, arrays.sleep,
@@ -93,10 +100,32 @@ class Resting:
         if new.steps % max(round(rest.recheck_period / dt), 1) == 0:
             asleep = arrays.sleep["status"] == SLEEPING
             woken = np.concatenate([woken, np.flatnonzero(asleep & (arrays.sleep["moved"] == 1.0))])
-        woken = np.unique(woken) if len(woken) else woken.copy()
+        woken = np.unique(np.concatenate([woken, struck]))
         copy_records(arrays.sleep, new.sleep, woken)
         sleeping.wake_rocks(woken, arrays.positions, new.sleep)
         return woken, touched[new.sleep["status"][touched] == SLEEPING]
+
+    def find_struck(
+        self,
+        n_rows: int,
+        rows: ContactRows,
+        bodies: np.ndarray,
+        arrays: RockArrays,
+        config: NonsmoothConfig,
+    ) -> IntArray:
+        """Return the sleeping rocks that a step is about to strike, see `blows`."""
+        if config.reduction != "rest" or n_rows == 0:
+            return self._touched[:0]
+        n_struck = find_struck(
+            n_rows, rows, bodies, self._mass, arrays.cache, arrays.sleep, self._make_thresholds(config),
+            config.impact_threshold, self._time_step, self._places, self._touched,
+        )  # fmt: skip
+        return self._touched[:n_struck].copy()
+
+    def _make_thresholds(self, config: NonsmoothConfig) -> sleeping.WakeThresholds:
+        rest = config.rest
+        load = rest.wake_load * self._strength * self._time_step
+        return sleeping.WakeThresholds(load, rest.wake_share, rest.wake_near_movers, rest.wake_steps)
 
     def fall_asleep(
         self, awake: IntArray, config: NonsmoothConfig, sensors: np.ndarray, new: RockArrays

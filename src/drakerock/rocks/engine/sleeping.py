@@ -247,7 +247,7 @@ def find_woken(
     some = _find_changes(chosen, sums, mass, by_movers, thresholds, sleep, changes2)
     pressures = np.zeros(n_touched)
     if some:
-        _sum_pressures(cache, places, pressures)
+        sum_pressures(cache, places, pressures)
     n_woken = 0
     for k in range(n_touched):
         i = chosen[k]
@@ -330,7 +330,7 @@ def _find_changes(
 
 
 @kernel
-def _sum_pressures(cache: ContactCache, places: Array, pressures: Array) -> None:
+def sum_pressures(cache: ContactCache, places: Array, pressures: Array) -> None:
     """Set the pressures (k,) of the rocks with a place to half the sum of the sizes of their contact impulses [N s]."""
     for row in range(len(cache.pairs)):
         a, b = cache.pairs[row, 0], cache.pairs[row, 1]

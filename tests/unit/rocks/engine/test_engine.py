@@ -581,6 +581,27 @@ def test_the_sensor_wakes_what_is_in_its_box():
     np.testing.assert_array_equal(found[:n], np.flatnonzero(inside))
 
 
+@pytest.mark.parametrize(("size", "speed"), [(1.0, 2.0), (0.5, 2.0), (1.3, 0.7)])
+def test_a_sleeping_rock_takes_a_blow_as_an_awake_one_does(size, speed):
+    """A box slides on ice into another one that sleeps: both go on with the speed of a plastic impact."""
+    pile = make_pile([[-2.0, 0, 0.25 * size], [0, 0, 0.25]], size=[size, 1.0])
+    rocks = RocksConfig(friction=1e-9)
+    box = [make_box(0.5, 0.5, 0.5)]
+    engine = make_engine(pile, box, make_plane_site(1e-9), rocks, NonsmoothConfig())
+    arrays, _ = run(engine, engine.make_arrays(pile), 0.5)
+    assert (arrays.status == SLEEPING).all()
+    velocities = np.array([[0, 0, 0, speed, 0, 0]])
+    arrays = engine.place(arrays, np.array([0]), np.array([[-0.3 - 0.25 * size, 0, 0.25 * size]]), velocities)
+    momentum = engine.mass[0] * speed
+    n_woken = 0
+    for _ in range(20):
+        arrays, report = engine.advance(arrays)
+        n_woken += report.n_woken
+        assert engine.mass @ arrays.velocities[:, 3] == pytest.approx(momentum, rel=1e-4)
+    assert n_woken == 1
+    np.testing.assert_allclose(arrays.velocities[:, 3], momentum / engine.mass.sum(), rtol=0.02)
+
+
 def test_rocks_that_leave_the_site_are_counted_and_taken_out():
     pile = make_pile([[0, 0, 0.25], [30.0, 0, 1.0]], velocities=[[0] * 6, [0, 0, 0, 2500.0, 0, 0]])
     engine = make_engine(pile, [make_box(0.5, 0.5, 0.5)])
