@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drakerock.rocks.engine.compiling import Array, Record, Rotation, Vector, kernel
 from drakerock.rocks.engine.contact_law import get_impulse
 from drakerock.rocks.engine.memory_access import make_aligned_zeros, prefetch
-from drakerock.rocks.engine.records import AWAKE, CACHED_POINT, LOST
+from drakerock.rocks.engine.records import CACHED_POINT
 from drakerock.rocks.engine.solve.rows import ContactRows, make_key, split_key
 from drakerock.rocks.engine.vectors import get_rotation, get_vector, rotate_back, set_vector
 
@@ -136,36 +136,39 @@ def is_loaded(point: Record) -> bool:
 
 
 @kernel
-def _is_active(status: int) -> bool:
-    return status == AWAKE or status == LOST  # `in` would be a loop
+def count_gaps(cache: ContactCache) -> int:
+    """Return the number of gaps in a cache."""
+    n_gaps = 0
+    for row in range(len(cache.pairs)):
+        if cache.pairs[row, 0] < 0:
+            n_gaps += 1
+    return n_gaps
 
 
 @kernel
 def index_cache(
-    cache: ContactCache, n_rocks: int, status: Array, active: Array, table: Array
-) -> tuple[int, int, int]:
+    cache: ContactCache, first: int, n_rocks: int, stirs: Array, active: Array, table: Array
+) -> tuple[int, int]:
     """Set a hash table from a pair's key to the first of its points (those of a pair are in line).
 
     Reads:
         cache: of the last step (m points).
+        first: the points before are of rocks that sleep.
         n_rocks: number of rocks.
-        status: (n,) of each rock. A pair of sleeping rocks, or of one and what stands still, is not searched, its
-            points stay as they are, and it is left out.
+        stirs: (n,) bool, the rocks that are awake, or have left the site in the last step. A pair of others, or of one
+            and what stands still, is not searched, its points stay as they are, and it is left out.
     Writes:
         active: (m,) at least: the active rows, those of rocks that have left the site among them.
         table: (2**k,) at least twice as many places as points; as many of the first as needed are set, -1 where
             empty.
 
     Returns:
-        how many places are in use: a power of two; look up in ``table[:places]``. The number of active rows, and
-        of gaps.
+        how many places are in use: a power of two; look up in ``table[:places]``. And the number of active rows.
     """
-    n_active, n_gaps = 0, 0
-    for row in range(len(cache.pairs)):
+    n_active = 0
+    for row in range(first, len(cache.pairs)):
         a, b = cache.pairs[row, 0], cache.pairs[row, 1]
-        if a < 0:
-            n_gaps += 1
-        elif _is_active(status[a]) or (b < n_rocks and _is_active(status[b])):
+        if a >= 0 and (stirs[a] or (b < n_rocks and stirs[b])):
             active[n_active] = row
             n_active += 1
     places = 64
@@ -183,7 +186,7 @@ def index_cache(
                 place = (place + 1) & mask
             table[place] = row
         last = key
-    return places, n_active, n_gaps
+    return places, n_active
 
 
 @kernel
@@ -268,7 +271,7 @@ def write_cache(
     time_step: float,
     speculative_gap: float,
     new: ContactCache,
-) -> tuple[int, int, int]:
+) -> tuple[int, int, int, int]:
     """Write the cache of the coming step: the points just solved, and all loaded points between sleeping rocks.
 
     The latter come first and are not moved: what is solved again leaves a gap (pair -1), so that a step in which little
@@ -289,7 +292,8 @@ def write_cache(
 
     Returns:
         the number of points, gaps included; beyond the capacity they are counted but lost. How many of them, the
-        first, are of sleeping rocks. And how many of these, the first, stay in their places or leave a gap there.
+        first, are of sleeping rocks. How many of these, the first, stay in their places or leave a gap there. And the
+        number of gaps.
     """
     capacity = len(new.pairs)
     n_freed = 0
@@ -315,7 +319,7 @@ def write_cache(
                 approach -= _calc_speed_along(velocities[b], row, row.arm_b)
             _write_point(row, get_rotation(rotations, a), row.gap - time_step * approach, new.points[n_new])
         n_new += 1
-    return n_new, min(n_sleeping, capacity), n_kept
+    return n_new, min(n_sleeping, capacity), n_kept, n_gaps
 
 
 @kernel

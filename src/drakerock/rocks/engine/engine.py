@@ -1,10 +1,11 @@
 """The engine: one step of all rocks, from state arrays to state arrays.
 
-A step wakes rocks (`sleeping`), finds the contacts of those that are awake (`collision.detection`), solves them
+A step wakes rocks (`resting`), finds the contacts of those that are awake (`collision.detection`), solves them
 together with the machine (`solve`), moves the rocks (`motion`), keeps the contacts for the next step
 (`contact_cache`) and lets rocks fall asleep. `NonsmoothEngine` holds what does not change during a simulation
 (shapes, masses, the site, settings) and scratch memory that never changes a result. All state is in a `RockArrays`,
-which callers own.
+which callers own (`rock_set`). What a step costs depends on the rocks that are awake, and hardly on all others:
+what of a state is known goes with it (`StateIndex`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from drakerock.errors import SimulationFailure
 from drakerock.rocks.config import RocksConfig
-from drakerock.rocks.engine import contact_cache, motion, sleeping
+from drakerock.rocks.engine import contact_cache, motion
 from drakerock.rocks.engine.collision.detection import ContactDetection, SiteBox
 from drakerock.rocks.engine.collision.narrow_phase import CollisionGeometry
 from drakerock.rocks.engine.collision.persistence import choose_search_modes
@@ -26,19 +27,17 @@ from drakerock.rocks.engine.collision.poses import CollisionBodies
 from drakerock.rocks.engine.collision.shapes import make_convex_shapes
 from drakerock.rocks.engine.compiling import announce_compilation
 from drakerock.rocks.engine.config import NonsmoothConfig
-from drakerock.rocks.engine.contact_cache import CacheIndex, ContactCache
+from drakerock.rocks.engine.contact_cache import CacheIndex
 from drakerock.rocks.engine.contact_law import ContactLaw
 from drakerock.rocks.engine.records import (
-    AWAKE,
     BODY,
-    FIXED,
-    LOST,
+    FOLLOWED,
+    SEARCHED,
     SENSOR,
-    SLEEP,
-    SLEEPING,
     as_records,
-    copy_records,
 )
+from drakerock.rocks.engine.resting import Resting
+from drakerock.rocks.engine.rock_set import RockSet, make_index_after
 from drakerock.rocks.engine.solve.batches import make_batch_arrays, make_single_bodies
 from drakerock.rocks.engine.solve.gauss_seidel import IterationSettings, solve_contacts
 from drakerock.rocks.engine.solve.impacts import solve_impacts
@@ -56,13 +55,14 @@ from drakerock.rocks.engine.state import (
     MachinePiece,
     MachineStep,
     RockArrays,
+    StateIndex,
     StepReport,
+    Token,
     make_machineless_step,
 )
 from drakerock.rocks.engine.surroundings import Surroundings
 from drakerock.rocks.materials import calc_spring_stiffness
 from drakerock.rocks.shapes import RockShape
-from drakerock.rocks.state import ContactMemory, PileState
 
 __all__ = [
     "ContactTable",
@@ -81,8 +81,6 @@ IntArray = NDArray[np.int64]
 GRAVITY = (0.0, 0.0, -9.81)
 # Where there is no gravity, impulses are measured by this [m/s^2].
 STANDARD_GRAVITY = 9.81
-# Quaternions are taken for unit ones within this, and keep their bits.
-UNIT_TOLERANCE = 1e-14
 # A step that failed is solved again with this many times the iterations and without acceleration, from a cold start
 # if need be; one that begins with an overlap beyond this share of the bound has as many at once. A light rock that
 # the machine presses into a jammed pile passes on little of the machine's momentum per iteration, and is squeezed
@@ -91,6 +89,8 @@ RETRY_FACTOR = 4
 DEEP_SHARE = 0.375
 # One that would make an overlap beyond this share is solved again, with contacts where its own motion would lead.
 DEEPENED_SHARE = 0.75
+
+NOBODY: IntArray = np.zeros(0, np.int64)
 
 
 class _Attempt(NamedTuple):
@@ -111,7 +111,7 @@ class _Solution(NamedTuple):
     has_impacts: bool
 
 
-class NonsmoothEngine:
+class NonsmoothEngine(RockSet):
     """Steps a given set of rocks in given surroundings, with the pieces of a machine if there is one.
 
     Args:
@@ -141,12 +141,7 @@ class NonsmoothEngine:
         gravity: Sequence[float] = GRAVITY,
     ) -> None:
         announce_compilation()
-        self.config = config
-        self.time_step = time_step
-        self.n_rocks = n = len(size)
-        self.shape_index = np.asarray(shape, np.int64)
-        self.size = np.asarray(size, float)
-        self.fixed = np.asarray(fixed, bool)
+        self.time_step, n = time_step, len(size)
         self.gravity = np.asarray(gravity, float)
         # What impulses are measured by.
         self._strength = float(np.linalg.norm(self.gravity)) or STANDARD_GRAVITY
@@ -163,7 +158,9 @@ class NonsmoothEngine:
 
         # Bodies: rocks, static pieces, planes, pieces of the machine.
         self.first_plane = n + n_static
-        self.first_piece = n + n_static + n_planes
+        super().__init__(
+            config, shape, size, fixed, self.first_plane + n_planes, surroundings.lower, surroundings.upper
+        )
         n_bodies = self.first_piece + len(pieces)
         if n_bodies >= KEY_STEP:
             raise ValueError(f"{n_bodies} bodies: more than {KEY_STEP - 1} cannot be told apart")
@@ -214,12 +211,10 @@ class NonsmoothEngine:
         else:
             self.contact_compliance[:n] = 1.0 / self.size
 
-        self._lower_site, self._upper_site = surroundings.lower, surroundings.upper
         self._make_scratch(n_bodies)
 
     def _make_scratch(self, n_bodies: int) -> None:
         n = self.n_rocks
-        self.capacity = self.config.memory_per_rock * n + 1024
         self.detection = ContactDetection(
             self._collision_bodies,
             CollisionGeometry(
@@ -228,7 +223,7 @@ class NonsmoothEngine:
             self.piece_body,
             self.radius,
             self.inverse_inertia_local,
-            SiteBox(self._lower_site, self._upper_site),
+            SiteBox(self.lower_site, self.upper_site),
             self.time_step,
         )
         self._bodies = np.zeros(n + 1, BODY)
@@ -238,7 +233,14 @@ class NonsmoothEngine:
         self._marks = np.zeros(n + 1 + self.n_machine_bodies, np.int64)
         self._active = np.zeros(self.capacity, np.int64)
         self._table = np.zeros(contact_cache.calc_places(2 * self.capacity), np.int64)
-        self._movers, self._by_movers = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self._stirs, self._all = np.zeros(n, np.bool_), np.arange(n)
+        self._resting = Resting(
+            self.radius, self.mass, self.lower_site, self.upper_site, self._strength, self.time_step,
+            self.detection.blocks,
+        )  # fmt: skip
+        # Rocks whose search mode was chosen, and the state that the detection has seen last.
+        self._chosen = self._all[:0]
+        self._posed: Token | None = None
         self._allocate_rows()
 
     def _allocate_rows(self) -> None:
@@ -246,135 +248,6 @@ class NonsmoothEngine:
         self._impacts = np.zeros((capacity, 3))
         self._depths = np.zeros(capacity)
         self._batches = make_batch_arrays(capacity)
-
-    # ---- state in and out
-
-    def make_arrays(self, pile: PileState) -> RockArrays:
-        """Return the state arrays of a pile; rocks that are marked as resting in its contacts stay asleep,
-        unless they have been given a velocity.
-
-        Raises:
-            ValueError: not the rocks this engine was made for.
-        """
-        if not (
-            np.array_equal(pile.shape, self.shape_index)
-            and np.array_equal(pile.size, self.size)
-            and np.array_equal(pile.fixed, self.fixed)
-        ):
-            raise ValueError("the pile's rocks are not those this engine was made for")
-        n = self.n_rocks
-        sleep = np.zeros(n, SLEEP)
-        sleep["status"] = np.where(self.fixed, FIXED, AWAKE)
-        sleep["anchor"] = pile.p_WRs
-        # A pile's contacts don't tell normals and gaps.
-        sleep["way"] = np.inf
-        cache = contact_cache.make_contact_cache(0)
-        if pile.contacts is not None:
-            cache = self._make_cache(pile.contacts)
-            if self.config.reduction == "rest":
-                still = (np.abs(pile.V_WRs) < self.config.rest.speed).all(axis=1)
-                asleep = pile.contacts.resting & still & ~self.fixed
-                sleep["status"][asleep] = SLEEPING
-                sums = np.zeros((n, 3))
-                contact_cache.sum_impulses(cache, n, sums)
-                sleep["reference"][asleep] = sums[asleep]
-        velocities = pile.V_WRs.copy()
-        velocities[sleep["status"] != AWAKE] = 0.0
-        length = np.linalg.norm(pile.q_WRs, axis=1, keepdims=True)
-        arrays = RockArrays(
-            np.where(np.abs(length - 1.0) < UNIT_TOLERANCE, pile.q_WRs, pile.q_WRs / length),
-            pile.p_WRs.copy(),
-            velocities,
-            sleep,
-            cache,
-        )
-        sleep["status"][self._find_lost(arrays.positions) & ~self.fixed] = LOST
-        return arrays
-
-    def make_pile(self, arrays: RockArrays, provenance: dict[str, object] | None = None) -> PileState:
-        """Return the pile of state arrays, loaded contacts included."""
-        pairs, points = arrays.cache.pairs.astype(np.int64), arrays.cache.points
-        # The machine's are not the pile's, and what carries no load is found again.
-        loaded = points["impulse"].any(axis=1)
-        kept = loaded & (pairs[:, 0] >= 0) & (pairs[:, 1] < self.first_piece)
-        pairs, points = pairs[kept], points[kept]
-        # Surfaces of the site are -1, -2, ...: independent of the number of rocks.
-        surface = pairs[:, 1] >= self.n_rocks
-        pairs[surface, 1] = self.n_rocks - 1 - pairs[surface, 1]
-        memory = ContactMemory(
-            pairs,
-            points["point"].copy(),
-            points["impulse"].copy(),
-            arrays.sleep["status"] == SLEEPING,
-        )
-        return PileState(
-            arrays.positions.copy(),
-            arrays.quaternions.copy(),
-            arrays.velocities.copy(),
-            self.shape_index,
-            self.size,
-            self.fixed,
-            dict(provenance or {}),
-            memory,
-        )
-
-    def _make_cache(self, stored: ContactMemory) -> ContactCache:
-        second = np.where(stored.pairs[:, 1] < 0, self.n_rocks - 1 - stored.pairs[:, 1], stored.pairs[:, 1])
-        known = np.flatnonzero(second < self.first_piece)[: self.capacity]
-        cache = contact_cache.make_contact_cache(len(known))
-        cache.pairs[:, 0], cache.pairs[:, 1] = stored.pairs[known, 0], second[known]
-        cache.points["point"] = stored.points[known]
-        cache.points["impulse"] = stored.impulses[known]
-        return cache
-
-    def _find_lost(self, positions: Array) -> NDArray[np.bool_]:
-        outside = (positions < self._lower_site) | (positions > self._upper_site)
-        return np.asarray(outside.any(axis=1))
-
-    def place(self, arrays: RockArrays, rocks: IntArray, p_WRs: Array, V_WRs: Array) -> RockArrays:
-        """Return the state with rocks put at positions (m, 3) with velocities (m, 6), awake, contacts forgotten."""
-        kept = ~np.isin(arrays.cache.pairs, rocks).any(axis=1)
-        new = replace(
-            arrays,
-            positions=arrays.positions.copy(),
-            velocities=arrays.velocities.copy(),
-            sleep=arrays.sleep.copy(),
-            cache=arrays.cache.select(kept),
-            n_sleeping=int(kept[: arrays.n_sleeping].sum()),
-        )
-        new.positions[rocks] = p_WRs
-        new.velocities[rocks] = V_WRs
-        for rock in rocks:
-            sleeping.wake_rock(rock, new.positions, new.sleep)
-        return new
-
-    def make_room(self) -> RockArrays:
-        """Return arrays that can hold any state of these rocks, the cache of full capacity; contents undefined."""
-        n = self.n_rocks
-        return RockArrays(
-            np.empty((n, 4)),
-            np.empty((n, 3)),
-            np.empty((n, 6)),
-            np.empty(n, SLEEP),
-            contact_cache.make_contact_cache(self.capacity),
-        )
-
-    def write_changes(self, new: RockArrays, report: StepReport, target: RockArrays) -> None:
-        """Write what a step has changed into a copy of the state before it.
-
-        Args:
-            new, report: what `step` gave.
-            target: changed, all but `n_sleeping` and `steps`; the cache has its full capacity.
-        """
-        for name in MOTION:
-            getattr(target, name)[report.awake] = getattr(new, name)[report.awake]
-        copy_records(new.sleep, target.sleep)
-        target.cache.pairs[report.freed] = -1
-        changed = slice(report.n_kept, len(new.cache.pairs))
-        for before, after in zip(target.cache, new.cache, strict=True):
-            before[changed] = after[changed]
-
-    # ---- the step
 
     def advance(self, arrays: RockArrays) -> tuple[RockArrays, StepReport]:
         """Step without a machine; see `step`."""
@@ -388,12 +261,11 @@ class NonsmoothEngine:
         Args:
             arrays: state at t_n; not changed.
             machine: the machine at t_n, see `MachineStep`.
-            room: where the result is written, see `make_room`; new if None. What the step does not change of poses,
-                velocities and cache is left as it is in it, see `write_changes`. To copy it in every step would take
-                as long as all passes over sleeping rocks.
+            room: where the result is written, see `make_room`; new if None. What the step does not change is left as
+                it is in it, see `write_changes`: to copy it would take longer than all else where little is awake.
 
         Returns:
-            state at t_n + dt, and the report.
+            state at t_n + dt, with its index if it is in a room, and the report.
 
         Raises:
             SimulationFailure: poses, or velocities of awake rocks, are not finite; or the result is not finite or has
@@ -401,13 +273,14 @@ class NonsmoothEngine:
                 acceleration.
         """
         iterations, acceleration = self.config.iterations, self.config.momentum
-        self.detection.extra_speeds[:] = 0.0
+        self.detection.forget_speeds()
+        if arrays.index is None:
+            arrays = replace(arrays, index=self.make_index(arrays))
         if room is None:
             room = self.make_room()
-            for name in MOTION:
-                getattr(room, name)[:] = getattr(arrays, name)
-            for old, copied in zip(arrays.cache, room.cache, strict=True):
-                copied[: len(old)] = old
+            self.copy_to(arrays, room)
+            new, report = self.step(arrays, machine, room)
+            return replace(new, index=None), report
         result = self._try_step(arrays, machine, room, _Attempt(iterations, acceleration, True, False))
         if self._has_converged(result):
             if result[1].n_deep == 0:
@@ -447,24 +320,40 @@ class NonsmoothEngine:
         return result is not None and result[1].residual <= self.config.max_residual
 
     def _try_step(
-        self, arrays: RockArrays, machine: MachineStep, room: RockArrays, attempt: _Attempt
+        self,
+        arrays: RockArrays,
+        machine: MachineStep,
+        room: RockArrays,
+        attempt: _Attempt,
+        struck: IntArray = NOBODY,
     ) -> tuple[RockArrays, StepReport] | None:
-        """Return state and report of a step; None if they are not finite."""
-        dt = self.time_step
+        """Return state and report of a step, which the rocks `struck` begin awake; None if they are not finite."""
+        dt, index = self.time_step, arrays.index
+        assert index is not None
         new = replace(room, steps=arrays.steps + 1)
-        copy_records(arrays.sleep, new.sleep)
         sensors = as_records(machine.sensors, SENSOR)
-        n_woken = self._wake(arrays, new, sensors)
-        status = new.sleep["status"].astype(np.int64)
-        awake = np.flatnonzero(status == AWAKE)
+        stale = self._find_stale(arrays, index)
+        woken, touched = self._resting.wake(arrays, index, self.config, sensors, struck, new)
+        awake = np.sort(np.concatenate([index.awake, woken])) if len(woken) else index.awake
+        stirred = np.concatenate([awake, touched])
 
         self._velocities[self.n_rocks + 1 :] = machine.arrays.jacobian @ machine.velocity
-        self._update_poses(arrays, new, machine, status, sensors, attempt.search_all)
+        self._choose_modes(arrays, awake, index.lost, sensors, attempt.search_all, new.sleep)
+        self._update_poses(arrays, awake, stale, machine)
+        self._posed = index.token
         motion.set_bodies(
             awake, arrays.velocities, self.inverse_mass, self.detection.inverse_inertia, self._bodies,
             self._velocities,
         )  # fmt: skip
-        n_rows, index = self._find_contacts(arrays, status)
+        # Of a state that a step has made, the points before this one are of rocks that sleep on.
+        first = 0 if len(woken) or index.before is None else arrays.n_sleeping
+        n_rows, cache_index = self._find_contacts(arrays, awake, first, index.n_gaps)
+        hit = self._resting.find_struck(n_rows, self.detection.rows, self._bodies, arrays, self.config)
+        if len(hit):
+            # Once more from the beginning, with these awake.
+            motion.clear_bodies(awake, self._bodies)
+            self._velocities[awake] = 0.0
+            return self._try_step(arrays, machine, room, attempt, np.concatenate([struck, hit]))
         solution = self._solve(n_rows, awake, machine, attempt)
 
         sane = motion.move(
@@ -477,8 +366,8 @@ class NonsmoothEngine:
             self._single_bodies.matrix[:] = 0.0
             self._velocities[:] = 0.0
             return None
-        n_points, n_sleeping, n_kept = contact_cache.write_cache(
-            self.n_rocks, arrays.cache, arrays.n_sleeping, index, n_rows, self.detection.rows,
+        n_points, n_sleeping, n_kept, n_gaps = contact_cache.write_cache(
+            self.n_rocks, arrays.cache, arrays.n_sleeping, cache_index, n_rows, self.detection.rows,
             self.detection.bodies.rotations, self._velocities, dt, 2.0 * self.config.search_distance, new.cache,
         )  # fmt: skip
         new.cache, new.n_sleeping = new.cache.select(slice(n_points)), n_sleeping
@@ -487,7 +376,8 @@ class NonsmoothEngine:
             n_rows, self.detection.rows, self._velocities, DEEPENED_SHARE * self.config.max_penetration
         )
         self._velocities[awake] = 0.0
-        n_asleep, n_lost = self._fall_asleep(new, sensors)
+        n_lost, n_asleep = self._resting.fall_asleep(awake, self.config, sensors, new)
+        new.index = make_index_after(new, awake, stirred, n_gaps, index.token)
         n_loaded = find_depths(n_rows, self.detection.rows, self._depths)
         depths = self._depths[:n_loaded]
         max_penetration = float(depths.max(initial=0.0))
@@ -499,15 +389,16 @@ class NonsmoothEngine:
             / dt,
             machine_velocity=solution.velocity,
             awake=awake,
+            stirred=stirred,
             n_kept=n_kept,
-            freed=self._active[: np.searchsorted(self._active[: index.n_active], n_kept)].copy(),
+            freed=self._active[: np.searchsorted(self._active[: cache_index.n_active], n_kept)].copy(),
             n_contacts=n_rows,
             n_loaded=n_loaded,
             n_iterations=solution.n_iterations,
             residual=solution.residual,
             max_penetration=max_penetration,
             p99_penetration=float(_calc_percentile(depths, 0.99)),
-            n_woken=n_woken,
+            n_woken=len(woken),
             n_asleep=n_asleep,
             n_lost=n_lost,
             n_deep=n_deep,
@@ -519,79 +410,64 @@ class NonsmoothEngine:
         )  # fmt: skip
         return new, report
 
-    def _wake(self, arrays: RockArrays, new: RockArrays, sensors: np.ndarray) -> int:
-        """Wake rocks of the new state; return their number."""
-        if self.config.reduction != "rest":
-            return sleeping.wake_all(arrays.positions, False, new.sleep)
-        rest, dt = self.config.rest, self.time_step
-        self._mark_by_movers(new.sleep, arrays.velocities, arrays.cache, arrays.n_sleeping)
-        thresholds = sleeping.WakeThresholds(
-            rest.wake_load * self._strength * dt, rest.wake_share, rest.wake_near_movers, rest.wake_steps
-        )
-        n_woken = sleeping.wake(
-            arrays.positions, self.radius, self.mass, arrays.cache, arrays.n_sleeping, sensors, self._by_movers,
-            thresholds, new.sleep,
-        )  # fmt: skip
-        if new.steps % max(round(rest.recheck_period / dt), 1) == 0:
-            n_woken += sleeping.wake_all(arrays.positions, True, new.sleep)
-        return n_woken
+    def _find_stale(self, arrays: RockArrays, index: StateIndex) -> IntArray:
+        """Return the rocks that are not where the detection saw them last."""
+        candidates = self._all
+        if self._posed is index.token:
+            candidates = candidates[:0]
+        elif self._posed is index.before and index.before is not None:
+            candidates = index.moved
+        self._posed = None
+        return self.detection.find_stale(candidates, arrays.quaternions, arrays.positions)
 
-    def _mark_by_movers(
-        self, sleep: np.ndarray, velocities: Array, cache: ContactCache, n_sleeping: int
-    ) -> None:
-        sleeping.mark_by_movers(
-            sleep, velocities, cache, n_sleeping, self.config.rest.mover_speed, self._movers, self._by_movers
-        )
-
-    def _fall_asleep(self, new: RockArrays, sensors: np.ndarray) -> tuple[int, int]:
-        """Take lost rocks out of the new state, let others fall asleep; return the numbers of those asleep and lost."""
-        rest, may_sleep = self.config.rest, self.config.reduction == "rest"
-        if may_sleep:
-            self._mark_by_movers(new.sleep, new.velocities, new.cache, new.n_sleeping)
-        n_lost = sleeping.take_out_lost(
-            self._lower_site, self._upper_site, new.positions, new.sleep, new.velocities
-        )
-        if not may_sleep:
-            return 0, n_lost
-        n_asleep = sleeping.fall_asleep(
-            new.positions, self.radius, sensors, self._by_movers, self.time_step,
-            sleeping.SleepLimits(rest.displacement, rest.time, rest.speed), new.sleep, new.velocities,
-        )  # fmt: skip
-        return n_asleep, n_lost
-
-    def _update_poses(
+    def _choose_modes(
         self,
         arrays: RockArrays,
-        new: RockArrays,
-        machine: MachineStep,
-        status: IntArray,
+        awake: IntArray,
+        lost: IntArray,
         sensors: np.ndarray,
         search_all: bool,
+        sleep: np.ndarray,
     ) -> None:
-        """Choose how contacts are searched, and set poses and boxes of what has moved."""
-        config, dt = self.config, self.time_step
+        """Choose how contacts are searched."""
+        config, modes = self.config, self.detection.modes
         search_all = search_all or config.search_period == 1
+        modes[self._chosen] = FOLLOWED
+        self._chosen = np.concatenate([awake, lost])
+        # What was in contact with a lost rock is searched, and found no more.
+        modes[lost] = SEARCHED
         choose_search_modes(
-            arrays.positions, arrays.velocities, self.radius, sensors, dt, config.slow_speed,
-            -1.0 if search_all else config.search_distance, search_all or arrays.steps % config.search_period == 0,
-            new.sleep, self.detection.modes,
-        )  # fmt: skip
-        stale = self.detection.find_stale(status, arrays.quaternions, arrays.positions)
-        # What is not finite differs from itself, so it is among these.
-        for name in MOTION:
-            if not motion.are_finite(getattr(arrays, name), stale):
-                raise SimulationFailure(f"rocks: {name} that are not finite")
-        self.detection.update_poses(
-            stale, status, arrays.quaternions, arrays.positions, arrays.velocities, machine.X_WBs,
-            self._velocities[self.n_rocks + 1 :], config.contact_margin,
+            awake, arrays.positions, arrays.velocities, self.radius, sensors, self.time_step, config.slow_speed,
+            -1.0 if search_all else config.search_distance,
+            search_all or arrays.steps % config.search_period == 0, sleep, modes,
         )  # fmt: skip
 
-    def _find_contacts(self, arrays: RockArrays, status: IntArray) -> tuple[int, CacheIndex]:
-        """Set the contact rows; return their number, and what of the cache was looked up."""
-        n_pairs = self.detection.find_pairs(status)
-        places, n_active, n_gaps = contact_cache.index_cache(
-            arrays.cache, self.n_rocks, status, self._active, self._table
+    def _update_poses(
+        self, arrays: RockArrays, awake: IntArray, stale: IntArray, machine: MachineStep
+    ) -> None:
+        """Set poses and boxes of what is awake or has moved."""
+        self._stirs[awake] = True
+        chosen = np.concatenate([awake, stale[~self._stirs[stale]]])
+        self._stirs[awake] = False
+        # What is not finite differs from itself, so it is among these.
+        for name in MOTION:
+            if not motion.are_finite(getattr(arrays, name), chosen):
+                raise SimulationFailure(f"rocks: {name} that are not finite")
+        self.detection.update_poses(
+            chosen, awake, arrays.quaternions, arrays.positions, arrays.velocities, machine.X_WBs,
+            self._velocities[self.n_rocks + 1 :], self.config.contact_margin,
+        )  # fmt: skip
+
+    def _find_contacts(
+        self, arrays: RockArrays, awake: IntArray, first: int, n_gaps: int
+    ) -> tuple[int, CacheIndex]:
+        """Set the contact rows; return their number, and what of the cache was looked up, from the row `first` on."""
+        n_pairs = self.detection.find_pairs(awake, arrays.sleep)
+        self._stirs[self._chosen] = True
+        places, n_active = contact_cache.index_cache(
+            arrays.cache, first, self.n_rocks, self._stirs, self._active, self._table
         )
+        self._stirs[self._chosen] = False
         index = CacheIndex(self._active, self._table[:places], n_active, n_gaps)
         n_rows = self.detection.find_contacts(n_pairs, arrays.cache, index, self._velocities, self.config)
         if n_rows > len(self._depths):

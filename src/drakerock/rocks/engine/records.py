@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 # Status of a rock.
 AWAKE, SLEEPING, FIXED, LOST = 0, 1, 2, 3
@@ -154,6 +155,8 @@ def as_records(matrix: np.ndarray, record: np.dtype[Any]) -> np.ndarray:
     return np.ascontiguousarray(matrix, record[0].base).reshape(-1).view(record)
 
 
-def copy_records(source: np.ndarray, target: np.ndarray) -> None:
-    """Copy records as numbers: numpy copies them field by field where fields share their room, thirty times slower."""
-    as_matrix(target)[:] = as_matrix(source)
+def copy_records(source: np.ndarray, target: np.ndarray, rows: NDArray[np.int64] | None = None) -> None:
+    """Copy records, or some rows of them, as bytes: where fields share their room, numpy is thirty times slower."""
+    record = np.dtype((np.void, source.dtype.itemsize))
+    chosen = slice(None) if rows is None else rows
+    target.view(record)[chosen] = source.view(record)[chosen]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,33 @@ def make_machineless_step() -> MachineStep:
     )
 
 
+class Token:
+    """Tells one state from all others; a copy is another one."""
+
+
+@dataclass(frozen=True, eq=False)
+class StateIndex:
+    """What of a state is else found by a look at all rocks and contacts. It never changes a result.
+
+    Attributes:
+        awake: (m,) rocks that are awake, in ascending order.
+        unsettled: sleeping rocks that have just fallen asleep, or whose load has changed.
+        moved: rocks that are not where they were before the step to this state.
+        lost: rocks that left the site in it.
+        n_gaps: of the contact cache.
+        before: of the state before the step, None if there is none.
+        token: of this state.
+    """
+
+    awake: IntArray
+    unsettled: IntArray
+    moved: IntArray
+    lost: IntArray
+    n_gaps: int
+    before: Token | None = None
+    token: Token = field(default_factory=Token)
+
+
 @dataclass(eq=False)
 class RockArrays:
     """All state of n rocks. The arrays of a step's result are new, or in the room that the step was given.
@@ -84,6 +111,8 @@ class RockArrays:
         cache: of m contact points, loaded or speculative; m changes from step to step.
         n_sleeping: so many of them, the first, are of rocks that slept in the last step; gaps among them.
         steps: how many have been taken.
+        index: None: not known, and found anew. Who changes arrays that have one, other than by
+            `NonsmoothEngine.write_changes`, takes it away.
     """
 
     quaternions: Array
@@ -93,6 +122,7 @@ class RockArrays:
     cache: ContactCache
     n_sleeping: int = 0
     steps: int = 0
+    index: StateIndex | None = None
 
     @property
     def status(self) -> Array:
@@ -127,6 +157,7 @@ class StepReport:
             torque [N m], force [N].
         machine_velocity: (v,) the machine's generalised velocities as the contact solve left them.
         awake: (m,) the rocks awake in the step, the only ones that moved.
+        stirred: those whose record of sleep the step has written, which are these and some sleeping ones.
         n_kept: so many points of the cache, the first, are where they were, but for those that left gaps.
         freed: (g,) these.
         n_contacts: contact points; n_loaded of them carry load.
@@ -145,6 +176,7 @@ class StepReport:
     F_Bs_W: Array
     machine_velocity: Array
     awake: IntArray
+    stirred: IntArray
     n_kept: int
     freed: IntArray
     n_contacts: int

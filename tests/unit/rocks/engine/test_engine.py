@@ -19,6 +19,7 @@ from drakerock.rocks.drake.interface import ROCK_SUMMARY
 from drakerock.rocks.engine import contact_cache, sleeping
 from drakerock.rocks.engine import engine as engine_module
 from drakerock.rocks.engine.collision import gjk
+from drakerock.rocks.engine.collision.blocks import make_blocks, update_blocks
 from drakerock.rocks.engine.config import NonsmoothConfig, RestConfig
 from drakerock.rocks.engine.engine import DEEP_SHARE, MachinePiece, MachineStep, make_machineless_step
 from drakerock.rocks.engine.records import (
@@ -73,9 +74,10 @@ def test_broad_phase_finds_every_pair_of_boxes_that_meet(seed):
     status = np.where(rng.random(len(pile)) < 0.4, SLEEPING, AWAKE)
     state, detection = (arrays.quaternions, arrays.positions), engine.detection
     detection.modes[: len(pile)] = SEARCHED
-    stale, machine = detection.find_stale(status, *state), make_machineless_step()
-    detection.update_poses(stale, status, *state, arrays.velocities, machine.X_WBs, np.zeros((0, 6)), 0.005)
-    n_pairs = detection.find_pairs(status)
+    stale, machine = detection.find_stale(np.arange(len(pile)), *state), make_machineless_step()
+    awake = np.flatnonzero(status == AWAKE)
+    detection.update_poses(stale, awake, *state, arrays.velocities, machine.X_WBs, np.zeros((0, 6)), 0.005)
+    n_pairs = detection.find_pairs(awake, arrays.sleep)
     found = [(int(a), int(b)) for a, b in np.transpose(detection.pairs)[:n_pairs]]
     assert len(found) == len(set(found))
     lower, upper = detection.boxes
@@ -155,15 +157,15 @@ def test_cached_contacts_are_found_again():
     contact_cache.sum_impulses(arrays.cache, 1, sums)
     np.testing.assert_allclose(sums[0], [0, 0, engine.mass[0] * 9.81 * 0.01], rtol=1e-6, atol=1e-6)
     table = np.zeros(128, np.int64)
-    status, active = np.zeros(1, np.int64), np.zeros(8, np.int64)
-    assert contact_cache.index_cache(arrays.cache, 1, status, active, table) == (64, 4, 0)
+    stirs, active = np.ones(1, np.bool_), np.zeros(8, np.int64)
+    assert contact_cache.index_cache(arrays.cache, 0, 1, stirs, active, table) == (64, 4)
     table = table[:64]
     key = contact_cache.read_key(arrays.cache, 0)
     assert contact_cache.find_in_cache(key, arrays.cache, table) == 0
     assert contact_cache.count_points(key, arrays.cache, 0) == 4
     assert contact_cache.find_in_cache(key + 1, arrays.cache, table) == -1
     # pairs without an awake rock are not searched
-    assert contact_cache.index_cache(arrays.cache, 1, status + SLEEPING, active, table) == (64, 0, 0)
+    assert contact_cache.index_cache(arrays.cache, 0, 1, ~stirs, active, table) == (64, 0)
     assert contact_cache.find_in_cache(key, arrays.cache, table) == -1
 
 
@@ -342,7 +344,9 @@ def test_a_step_into_given_room_is_the_same_step():
             assert np.isnan(value[still]).all()
             assert np.array_equal(getattr(arrays, name)[still], whole[still])
         else:
-            assert np.array_equal(value, whole), name
+            assert np.array_equal(value[report.stirred], whole[report.stirred]), name
+            others = np.setdiff1d(still, report.stirred)
+            assert np.array_equal(getattr(arrays, name)[others], whole[others])
         assert np.shares_memory(value, getattr(room, name))
         assert np.array_equal(getattr(arrays, name), getattr(before, name))
 
@@ -425,6 +429,68 @@ def test_changes_written_into_a_copy_are_the_whole_state():
         arrays = new
 
 
+def copy_state(engine, arrays):
+    """Return a copy of a state in arrays of full capacity, as the rocks' system keeps it; and the state in it."""
+    copy = engine.make_room()
+    engine.copy_to(arrays, copy)
+    return copy, replace(
+        copy,
+        cache=copy.cache.select(slice(len(arrays.cache.pairs))),
+        n_sleeping=arrays.n_sleeping,
+        steps=arrays.steps,
+    )
+
+
+def step_in_place(engine, copy, state, machine, room):
+    """Step a state that lies in `copy`, its index known; return it and the report."""
+    new, report = engine.step(state, machine, room)
+    engine.write_changes(new, report, copy)
+    cache = copy.cache.select(slice(len(new.cache.pairs)))
+    return replace(copy, cache=cache, n_sleeping=new.n_sleeping, steps=new.steps, index=new.index), report
+
+
+def assert_same_state(one, other):
+    for name in ("positions", "quaternions", "velocities", "sleep"):
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+    full = ~is_gap(other)
+    assert np.array_equal(is_gap(one), ~full)
+    for found, whole in zip(one.cache, other.cache, strict=True):
+        assert np.array_equal(found[full], whole[full])
+
+
+def test_what_is_known_of_a_state_changes_nothing():
+    """A sleeping heap that rocks fall on, one of which leaves the site, and a sensor that comes near.
+
+    Two states by turns in one engine, each stepped with its index in place, and by another engine that looks at all
+    rocks in every step.
+    """
+    engine, arrays = settle_at_rest()
+    pile = engine.make_pile(arrays)
+    other = make_engine(pile, SHAPES, make_plane_site(planes=5), config=engine.config)
+    top = np.argsort(pile.p_WRs[:, 2])[-6:]
+    V_WRs = np.zeros((6, 6))
+    V_WRs[:, 3:] = [0.0, 0.0, -4.0]
+    V_WRs[0, 3:] = [0.0, 0.0, 4000.0]
+    thrown = engine.place(arrays, top, pile.p_WRs[top] + [0.0, 0.0, 1.0], V_WRs)
+    machine, room = make_machineless_step(), engine.make_room()
+    states = [copy_state(engine, thrown), copy_state(engine, arrays)]
+    expected = [thrown, arrays]
+    seen = np.zeros(4)
+    for k in range(60):
+        box = np.concatenate([np.eye(3).reshape(-1), [2.5 - 0.05 * k, 0.0, 0.0], [-0.3] * 3, [0.3] * 3])
+        machine = replace(machine, sensors=box[None]) if k >= 20 else machine
+        for number in range(2) if k % 3 < 2 else (0,):
+            copy, state = states[number]
+            state, report = step_in_place(engine, copy, state, machine, room)
+            states[number] = copy, state
+            expected[number], whole = other.step(expected[number], machine)
+            assert_same_state(state, expected[number])
+            for name in ("n_woken", "n_asleep", "n_lost", "n_contacts", "residual"):
+                assert getattr(report, name) == getattr(whole, name), name
+            seen += [report.n_woken, report.n_asleep, report.n_lost, len(report.freed)]
+    assert (seen > [20, 20, 0, 20]).all()
+
+
 def test_two_contexts_keep_their_solutions_apart():
     """The solution of a context is not lost when that of its clone is found."""
     pile = draw_pile(3, 20)
@@ -454,7 +520,7 @@ def test_the_cache_keeps_keys_and_simplices_whole():
     index, old = contact_cache.CacheIndex(empty, empty, 0, 0), contact_cache.make_contact_cache(0)
     velocities = np.zeros((KEY_STEP, 6))
     written = contact_cache.write_cache(0, old, 0, index, 1, rows, rotations, velocities, 0.01, 0.0, cache)
-    assert written == (1, 0, 0)
+    assert written == (1, 0, 0, 0)
     assert contact_cache.read_key(cache, 0) == key
     found = np.zeros((3, 2), np.int64)
     assert gjk.decode_simplex(contact_cache.read_simplex(cache.points[0]), found) == 3
@@ -468,6 +534,20 @@ def test_without_reduction_nothing_rests():
     after, report = engine.advance(arrays)
     assert report.n_awake == engine.n_rocks
     assert not after.status.any()
+
+
+def wake(positions, mass, cache, n_sleeping, by_movers, thresholds, sleep):
+    """Wake rocks by their loads; return their number."""
+    n = len(sleep)
+    places, touched, woken = (np.zeros(n, np.int64) for _ in range(3))
+    unsettled = np.flatnonzero((sleep["status"] == SLEEPING) & (sleep["changed_steps"] != 0.0))
+    n_touched, n_all = sleeping.find_touched(cache, n_sleeping, unsettled, sleep, places, touched)
+    n_woken = sleeping.find_woken(
+        n_touched, touched[:n_all], mass, cache, by_movers, thresholds, places, sleep, woken
+    )
+    assert not places.any()
+    sleeping.wake_rocks(woken[:n_woken], positions, sleep)
+    return n_woken
 
 
 def make_thresholds(load, share, near_movers, steps=1):
@@ -485,14 +565,41 @@ def test_the_sensor_wakes_what_is_in_its_box():
     contact_cache.sum_impulses(arrays.cache, len(sleep), sums)
     sleep["reference"] = sums
     box = np.concatenate([np.eye(3).reshape(-1), np.zeros(3), [-10, -10, -1], [0.0, 10, 10]])
-    alone = np.zeros(len(sleep), np.bool_)
-    n = sleeping.wake(
-        arrays.positions, engine.radius, engine.mass, arrays.cache, 0, as_records(box[None], SENSOR), alone,
-        make_thresholds(0.1, 0.1, 0.1, 3), sleep,
-    )  # fmt: skip
     inside = arrays.positions[:, 0] < engine.radius
-    assert n == inside.sum()
-    assert ((sleep["status"] == AWAKE) == inside).all()
+    assert 0 < inside.sum() < len(inside)
+    found, blocks = np.zeros(len(sleep), np.int64), make_blocks(len(sleep))
+    update_blocks(np.arange(len(sleep)), arrays.positions, blocks)
+    n = sleeping.find_sensed(
+        arrays.positions,
+        engine.radius,
+        engine.radius.max(),
+        as_records(box[None], SENSOR),
+        blocks,
+        sleep,
+        found,
+    )
+    np.testing.assert_array_equal(found[:n], np.flatnonzero(inside))
+
+
+@pytest.mark.parametrize(("size", "speed"), [(1.0, 2.0), (0.5, 2.0), (1.3, 0.7)])
+def test_a_sleeping_rock_takes_a_blow_as_an_awake_one_does(size, speed):
+    """A box slides on ice into another one that sleeps: both go on with the speed of a plastic impact."""
+    pile = make_pile([[-2.0, 0, 0.25 * size], [0, 0, 0.25]], size=[size, 1.0])
+    rocks = RocksConfig(friction=1e-9)
+    box = [make_box(0.5, 0.5, 0.5)]
+    engine = make_engine(pile, box, make_plane_site(1e-9), rocks, NonsmoothConfig())
+    arrays, _ = run(engine, engine.make_arrays(pile), 0.5)
+    assert (arrays.status == SLEEPING).all()
+    velocities = np.array([[0, 0, 0, speed, 0, 0]])
+    arrays = engine.place(arrays, np.array([0]), np.array([[-0.3 - 0.25 * size, 0, 0.25 * size]]), velocities)
+    momentum = engine.mass[0] * speed
+    n_woken = 0
+    for _ in range(20):
+        arrays, report = engine.advance(arrays)
+        n_woken += report.n_woken
+        assert engine.mass @ arrays.velocities[:, 3] == pytest.approx(momentum, rel=1e-4)
+    assert n_woken == 1
+    np.testing.assert_allclose(arrays.velocities[:, 3], momentum / engine.mass.sum(), rtol=0.02)
 
 
 def test_rocks_that_leave_the_site_are_counted_and_taken_out():
@@ -800,7 +907,7 @@ def test_a_rock_under_pressure_wakes_by_a_share_of_it(squeeze, wakes):
     cache.points["impulse"][0, 2] = -0.69 * weight
     alone = np.zeros(1, np.bool_)
     thresholds = make_thresholds(0.3 * 9.81 * 0.01, 0.1, 0.1)
-    n = sleeping.wake(np.zeros((1, 3)), np.ones(1), mass, cache, 0, NOWHERE, alone, thresholds, sleep)
+    n = wake(np.zeros((1, 3)), mass, cache, 0, alone, thresholds, sleep)
     assert n == wakes
 
 
@@ -816,21 +923,21 @@ def test_a_rock_that_leans_on_a_mover_wakes_sooner_and_does_not_fall_asleep(move
     velocities[0, 5] = 0.02 if mover else 0.005
     # The load of rock 1 has changed by 0.1 of the weight, that of rock 2 by 0.2: 0.3 wakes a rock otherwise.
     cache.points["impulse"][:, 2] = [0.1 * weight, 0.2 * weight]
-    sleeping.mark_by_movers(sleep, velocities, cache, 0, 0.01, movers, marks)
-    np.testing.assert_array_equal(movers, [mover, False, False])
+    sleeping.mark_by_movers(np.arange(3), sleep, velocities, cache, 0, 0.01, movers, marks)
+    assert not movers.any()
     np.testing.assert_array_equal(marks, [False, mover, False])
     # A speculative point is no contact yet.
     apart = cache._replace(points=np.zeros_like(cache.points))
     unmarked = np.ones(3, np.bool_)
-    sleeping.mark_by_movers(sleep, velocities, apart, 0, 0.01, movers, unmarked)
+    sleeping.mark_by_movers(np.arange(3), sleep, velocities, apart, 0, 0.01, movers, unmarked)
     assert not unmarked.any()
     rocks, thresholds = (np.zeros((3, 3)), np.ones(3)), make_thresholds(0.3 * 9.81 * 0.01, 0.0, 0.1)
-    sleeping.wake(*rocks, mass, cache, 0, NOWHERE, marks, thresholds, sleep)
+    wake(rocks[0], mass, cache, 0, marks, thresholds, sleep)
     np.testing.assert_array_equal(sleep["status"], [AWAKE, AWAKE if mover else SLEEPING, SLEEPING])
     # Long still, they may fall asleep again, but not the one by the mover.
     sleep["status"], sleep["still_time"] = AWAKE, 1.0
     limits = sleeping.SleepLimits(1e-3, 0.1, 0.05)
-    sleeping.fall_asleep(*rocks, NOWHERE, marks, 0.01, limits, sleep, velocities)
+    sleeping.fall_asleep(np.arange(3), *rocks, NOWHERE, marks, 0.01, limits, sleep, velocities)
     np.testing.assert_array_equal(sleep["status"], [SLEEPING, AWAKE if mover else SLEEPING, SLEEPING])
 
 
@@ -846,9 +953,7 @@ def test_a_rock_wakes_when_what_carried_it_has_left_the_site(other, n_sleeping, 
     sleep["status"] = SLEEPING, other
     sleep["reference"][:, 2] = np.float32(weight), -np.float32(weight)
     alone, thresholds = np.zeros(2, np.bool_), make_thresholds(0.3 * 9.81 * 0.01, 0.3, 0.1)
-    n = sleeping.wake(
-        np.zeros((2, 3)), np.ones(2), np.full(2, 100.0), cache, n_sleeping, NOWHERE, alone, thresholds, sleep
-    )
+    n = wake(np.zeros((2, 3)), np.full(2, 100.0), cache, n_sleeping, alone, thresholds, sleep)
     assert n == wakes
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drakerock.rocks.engine.collision.blocks import BLOCK, Blocks, is_block_near
 from drakerock.rocks.engine.collision.poses import Boxes
 from drakerock.rocks.engine.compiling import Array, allocating_kernel, kernel
 from drakerock.rocks.engine.records import LOST
@@ -76,35 +77,45 @@ def find_region(seekers: Array, others: Array, boxes: Boxes) -> tuple[Array, Arr
 
 @allocating_kernel
 def find_near(
-    rocks: Array, positions: Array, low: Array, high: Array, reach: float, near: Array
+    number: int,
+    classes: Array,
+    positions: Array,
+    blocks: Blocks,
+    low: Array,
+    high: Array,
+    reach: float,
+    near: Array,
 ) -> tuple[int, Array, Array]:
-    """Find the rocks within reach of a box: only they need to be sorted into a grid.
+    """Find the rocks of a class of size within reach of a box: only they need to be sorted into a grid.
 
     Reads:
-        rocks: (m,) indices.
+        number, classes: of the class, and (n,) that of each rock.
         positions: (n, 3) [m].
+        blocks: of all rocks.
         low, high: (3,) corners of the box [m].
         reach: how far a rock reaches from its centre at most [m].
     Writes:
-        near: (m,) their indices.
+        near: (n,) their indices, in ascending order.
 
     Returns:
         their number, and the corners (3,) of the box around their centres [m].
     """
     n_near = 0
     first, last = np.full(3, np.inf), np.full(3, -np.inf)
-    for k in range(len(rocks)):
-        i = rocks[k]
-        inside = True
-        for d in range(3):
-            if not low[d] - reach < positions[i, d] < high[d] + reach:
-                inside = False
-        if inside:
-            near[n_near] = i
-            n_near += 1
+    for block in range(len(blocks.lower)):
+        if not is_block_near(block, low, high, reach, blocks):
+            continue
+        for i in range(BLOCK * block, min(BLOCK * (block + 1), len(classes))):
+            inside = classes[i] == number
             for d in range(3):
-                first[d] = min(first[d], positions[i, d])
-                last[d] = max(last[d], positions[i, d])
+                if not low[d] - reach < positions[i, d] < high[d] + reach:
+                    inside = False
+            if inside:
+                near[n_near] = i
+                n_near += 1
+                for d in range(3):
+                    first[d] = min(first[d], positions[i, d])
+                    last[d] = max(last[d], positions[i, d])
     return n_near, first, last
 
 
@@ -182,7 +193,7 @@ def _find_range(low: float, high: float, axis: int, grid: Grid) -> tuple[int, in
 def find_rock_pairs(
     seekers: Array,
     n_rocks: int,
-    status: Array,
+    sleep: Array,
     seeks: Array,
     boxes: Boxes,
     grid: Grid,
@@ -194,7 +205,7 @@ def find_rock_pairs(
     Reads:
         seekers: rocks, and bodies of the machine (index >= n_rocks), whose neighbours are wanted.
         n_rocks: number of rocks.
-        status: (n,) of the rocks.
+        sleep: (n,) records `SLEEP` of the rocks.
         seeks: (n,) bool, the rocks that are among the seekers of some call.
         boxes: of all bodies.
         grid: some of the rocks, sorted.
@@ -227,15 +238,15 @@ def find_rock_pairs(
                     ):
                         continue
                     j = grid.rocks[k]
-                    if _is_new_pair(i, j, n_rocks, status, seeks):
+                    if _is_new_pair(i, j, n_rocks, sleep, seeks):
                         n_pairs = _add_pair(min(i, j), max(i, j), n_pairs, pairs)
     return n_pairs
 
 
 @kernel
-def _is_new_pair(i: int, j: int, n_rocks: int, status: Array, seeks: Array) -> bool:
+def _is_new_pair(i: int, j: int, n_rocks: int, sleep: Array, seeks: Array) -> bool:
     """Return whether seeker i and rock j are a pair; two seekers, which find each other twice, are one once."""
-    if j == i or status[j] == LOST:
+    if j == i or sleep[j].status == LOST:
         return False
     return not (i < n_rocks and seeks[j] and i > j)
 

@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drakerock.rocks.engine.collision import broad_phase, narrow_phase, persistence, poses, speculative
+from drakerock.rocks.engine.collision.blocks import make_blocks, update_blocks
 from drakerock.rocks.engine.collision.broad_phase import Grid
 from drakerock.rocks.engine.collision.narrow_phase import CollisionGeometry, SearchSettings
 from drakerock.rocks.engine.collision.poses import Boxes, CollisionBodies
 from drakerock.rocks.engine.compiling import Array
 from drakerock.rocks.engine.config import NonsmoothConfig
 from drakerock.rocks.engine.contact_cache import CacheIndex, ContactCache, make_axis_cache
-from drakerock.rocks.engine.records import AWAKE, FOLLOWED, SEARCHED
+from drakerock.rocks.engine.records import FOLLOWED, SEARCHED
 from drakerock.rocks.engine.solve.rows import ContactRows, make_contact_rows
 
 IntArray = NDArray[np.int64]
@@ -39,7 +40,7 @@ class ContactDetection:
     Attributes:
         bodies, boxes: where all bodies are, and the boxes around them.
         modes: (bodies,) how the contacts of each are found, see `collision.persistence`.
-        extra_speeds: (bodies,) see `collision.speculative` [m/s]; to be set to 0 before a step.
+        extra_speeds: (bodies,) see `collision.speculative` [m/s]; `forget_speeds` before a step.
         pairs: of the broad phase; `find_pairs` gives their number.
         rows: contact rows; `find_contacts` gives their number.
         inverse_inertia: (n, 6) of the rocks in W's axes.
@@ -72,8 +73,9 @@ class ContactDetection:
         self.boxes = Boxes(np.full((n_bodies, 3), np.inf), np.full((n_bodies, 3), -np.inf))
         # What is no rock does not move, or is searched with what does.
         self.modes = np.full(n_bodies, SEARCHED, np.int8)
-        self.modes[n : geometry.first_piece] = FOLLOWED
+        self.modes[: geometry.first_piece] = FOLLOWED
         self.extra_speeds = np.zeros(n_bodies)
+        self._is_driven = False
         self.inverse_inertia = np.zeros((n, 6))
         self.statistics = np.zeros(4, np.int64)
         self._geometry = geometry
@@ -82,7 +84,8 @@ class ContactDetection:
         self._inverse_inertia_local = inverse_inertia_local
         self._site_box = site_box
         self._time_step = time_step
-        self._classes = _make_size_classes(radius)
+        self._classes, self._reaches = _make_size_classes(radius)
+        self.blocks = make_blocks(n)
         self._posed_quaternions = np.full((n, 4), np.nan)
         self._stale, self._near = np.zeros(n, np.int64), np.zeros(n, np.int64)
         self._seeks = np.zeros(n, np.bool_)
@@ -100,17 +103,19 @@ class ContactDetection:
         self.pairs = broad_phase.make_pairs(capacity)
         self._look_up = narrow_phase.make_look_up(capacity)
 
-    def find_stale(self, status: IntArray, quaternions: Array, positions: Array) -> IntArray:
-        """Return the rocks whose pose has to be set, see `update_poses`; valid until the next call."""
+    def find_stale(self, candidates: IntArray, quaternions: Array, positions: Array) -> IntArray:
+        """Return which of some rocks are not where they were last; valid until the next call."""
         n_stale = poses.find_stale(
-            status, quaternions, positions, self._posed_quaternions, self.bodies.positions, self._stale
+            candidates, quaternions, positions, self._posed_quaternions, self.bodies.positions, self._stale
         )
-        return self._stale[:n_stale]
+        stale = self._stale[:n_stale]
+        update_blocks(stale, positions, self.blocks)
+        return stale
 
     def update_poses(
         self,
-        stale: IntArray,
-        status: IntArray,
+        chosen: IntArray,
+        awake: IntArray,
         quaternions: Array,
         positions: Array,
         velocities: Array,
@@ -121,18 +126,19 @@ class ContactDetection:
         """Set positions, rotations and boxes: of awake rocks, of others that were moved, of the machine.
 
         Args:
-            stale: rocks, from `find_stale`.
-            status, quaternions, positions, velocities: of all rocks.
+            chosen: all these rocks, see `find_stale`.
+            awake: those of them that are awake.
+            quaternions, positions, velocities: of all rocks.
             X_WBs, V_WBs: (b, 4, 4), (b, 6) poses and spatial velocities of the machine's bodies.
             margin: of the boxes [m].
         """
         poses.calc_poses(
-            stale, self._geometry.shapes, quaternions, positions, velocities, self._time_step, margin,
+            chosen, self._geometry.shapes, quaternions, positions, velocities, self._time_step, margin,
             self._inverse_inertia_local, self.bodies, self.boxes, self.inverse_inertia,
         )  # fmt: skip
         # Boxes of others are kept from step to step.
-        if self.extra_speeds.any():
-            driven = np.flatnonzero((self.extra_speeds[: len(status)] > 0.0) & (status == AWAKE))
+        if self._is_driven:
+            driven = awake[self.extra_speeds[awake] > 0.0]
             self.boxes.lower[driven] -= self._time_step * self.extra_speeds[driven, None]
             self.boxes.upper[driven] += self._time_step * self.extra_speeds[driven, None]
         poses.calc_piece_poses(
@@ -140,37 +146,45 @@ class ContactDetection:
             self._time_step, margin, self.bodies, self.boxes,
         )  # fmt: skip
 
-    def find_pairs(self, status: IntArray) -> int:
+    def find_pairs(self, awake: IntArray, sleep: np.ndarray) -> int:
         """Find the pairs whose boxes meet, of rocks that are awake and searched, and of the machine.
+
+        Args:
+            awake: rocks.
+            sleep: (n,) records of all rocks; read are those of such as have left the site.
 
         Returns:
             their number.
         """
-        n, geometry = len(status), self._geometry
-        self._seeks[:] = (status == AWAKE) & (self.modes[:n] != FOLLOWED)
-        seekers = np.flatnonzero(self._seeks)
+        n, geometry = len(sleep), self._geometry
+        seekers = awake[self.modes[awake] != FOLLOWED]
+        self._seeks[seekers] = True
         low, high = broad_phase.find_region(seekers, self._pieces, self.boxes)
-        grids = [self._sort_grid(rocks, reach, low, high) for rocks, reach in self._classes]
+        grids = [self._sort_grid(number, reach, low, high) for number, reach in enumerate(self._reaches)]
         while True:
             n_pairs = 0
             for one in grids:
                 chosen = one.rocks[self._seeks[one.rocks]]
                 for grid in grids:
-                    n_pairs = self._search(chosen, status, grid, n_pairs)
+                    n_pairs = self._search(chosen, sleep, grid, n_pairs)
             n_pairs = broad_phase.find_static_pairs(
                 seekers, n, geometry.first_plane, geometry.planes, self.boxes, n_pairs, self.pairs
             )
             # The machine's pairs come last.
             for grid in grids:
-                n_pairs = self._search(self._pieces, status, grid, n_pairs)
+                n_pairs = self._search(self._pieces, sleep, grid, n_pairs)
             if n_pairs <= len(self.pairs.a):
-                return n_pairs
+                break
             self._allocate_pairs(n_pairs + n_pairs // 4)
+        self._seeks[seekers] = False
+        return n_pairs
 
-    def _sort_grid(self, rocks: IntArray, reach: float, low: Array, high: Array) -> Grid:
+    def _sort_grid(self, number: int, reach: float, low: Array, high: Array) -> Grid:
         """Sort the rocks of one class of size that are within reach of the box into a grid."""
         inverse_width, positions = 1.0 / (CELL_WIDTH * reach), self.bodies.positions
-        n_near, first, last = broad_phase.find_near(rocks, positions, low, high, reach, self._near)
+        n_near, first, last = broad_phase.find_near(
+            number, self._classes, positions, self.blocks, low, high, reach, self._near
+        )
         origin = np.maximum(first, self._site_box.lower)
         extent = np.minimum(last, self._site_box.upper) - origin if n_near > 0 else np.zeros(3)
         n_cells = np.maximum(np.ceil(extent * inverse_width), 1).astype(np.int64)
@@ -182,11 +196,12 @@ class ContactDetection:
         )
         return grid
 
-    def _search(self, seekers: IntArray, status: IntArray, grid: Grid, n_pairs: int) -> int:
-        n = len(status)
+    def _search(self, seekers: IntArray, sleep: np.ndarray, grid: Grid, n_pairs: int) -> int:
+        if len(seekers) == 0 or len(grid.rocks) == 0:
+            return n_pairs
         return int(
             broad_phase.find_rock_pairs(
-                seekers, n, status, self._seeks, self.boxes, grid, n_pairs, self.pairs
+                seekers, len(sleep), sleep, self._seeks, self.boxes, grid, n_pairs, self.pairs
             )
         )
 
@@ -204,6 +219,9 @@ class ContactDetection:
         Returns:
             their number.
         """
+        if n_pairs == 0 and index.n_active == 0:
+            self.statistics[:] = 0
+            return 0
         geometry = self._geometry
         settings = SearchSettings(
             self._time_step, config.contact_margin, config.manifold_gap, config.face_cosine, config.slow_speed
@@ -230,18 +248,26 @@ class ContactDetection:
             velocities: (bodies of the solve, 6) after it.
             depth: see `collision.speculative` [m].
         """
-        return int(
-            speculative.find_deep_overlaps(
-                n_rows, rows, self._geometry, self.bodies, velocities, self._time_step, depth,
-                self.extra_speeds, self._workspace.gjk,
-            )
+        if n_rows == 0:
+            return 0
+        n_deep = speculative.find_deep_overlaps(
+            n_rows, rows, self._geometry, self.bodies, velocities, self._time_step, depth, self.extra_speeds,
+            self._workspace.gjk,
         )  # fmt: skip
+        self._is_driven |= n_deep > 0
+        return int(n_deep)
+
+    def forget_speeds(self) -> None:
+        """Set `extra_speeds` to 0."""
+        if self._is_driven:
+            self.extra_speeds[:] = 0.0
+            self._is_driven = False
 
 
-def _make_size_classes(radius: Array) -> list[tuple[IntArray, float]]:
-    """Return the rocks by classes of size (a factor of two each) with the largest radius of each class [m]."""
+def _make_size_classes(radius: Array) -> tuple[IntArray, list[float]]:
+    """Return the class of size of each rock (a factor of two each), and the largest radius of each class [m]."""
     if len(radius) == 0:
-        return []
+        return np.zeros(0, np.int64), []
     level = np.floor(np.log2(radius / radius.min() * CLASS_TOLERANCE)).astype(np.int64)
-    classes = [np.flatnonzero(level == k) for k in np.unique(level)]
-    return [(rocks, float(radius[rocks].max())) for rocks in classes]
+    _, classes = np.unique(level, return_inverse=True)
+    return classes, [float(radius[classes == k].max()) for k in range(classes.max() + 1)]

@@ -21,7 +21,7 @@ from drakerock.rocks.engine.contact_cache import (
     widen,
 )
 from drakerock.rocks.engine.memory_access import AHEAD, prefetch
-from drakerock.rocks.engine.records import AWAKE, COMOVING, FOLLOWED, LOST, SEARCHED
+from drakerock.rocks.engine.records import COMOVING, FOLLOWED, SEARCHED
 from drakerock.rocks.engine.sleeping import is_sensed
 from drakerock.rocks.engine.solve.rows import ContactRows, make_key
 from drakerock.rocks.engine.vectors import (
@@ -39,6 +39,7 @@ from drakerock.rocks.engine.vectors import (
 
 @kernel
 def choose_search_modes(
+    awake: Array,
     positions: Array,
     velocities: Array,
     radius: Array,
@@ -58,6 +59,7 @@ def choose_search_modes(
     that move like them do.
 
     Reads:
+        awake: (m,) the rocks to do; all others are FOLLOWED.
         positions, velocities, radius, sensors: see `sleeping`.
         time_step: [s].
         slow_speed: below it rocks are slow, their turning at their bounding spheres included [m/s].
@@ -65,14 +67,12 @@ def choose_search_modes(
         search_fast: whether the others, which else are COMOVING, are searched too.
     Writes:
         sleep: (n,) records `SLEEP`: the way of each rock.
-        modes: (n,) at least.
+        modes: (n,) at least, of these.
     """
-    for i in range(len(sleep)):
-        rock = sleep[i]
-        modes[i] = SEARCHED if rock.status == LOST else FOLLOWED
-        if rock.status != AWAKE:
-            continue
-        v = velocities[i]
+    for s in range(len(awake)):
+        i = awake[s]
+        rock, v = sleep[i], velocities[i]
+        modes[i] = FOLLOWED
         spin = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
         speed = math.sqrt(v[3] * v[3] + v[4] * v[4] + v[5] * v[5]) + radius[i] * spin
         rock.way += time_step * speed

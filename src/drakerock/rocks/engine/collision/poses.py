@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from drakerock.rocks.engine.collision.geometry import Core, get_corner
 from drakerock.rocks.engine.collision.shapes import ConvexShapes
 from drakerock.rocks.engine.compiling import Array, Vector, kernel
-from drakerock.rocks.engine.records import AWAKE
 from drakerock.rocks.engine.vectors import (
     dot,
     get_rotation,
@@ -69,17 +68,17 @@ def get_offset(bodies: CollisionBodies, a: int, b: int) -> Vector:
 
 @kernel
 def find_stale(
-    status: Array,
+    candidates: Array,
     quaternions: Array,
     positions: Array,
     posed_quaternions: Array,
     posed_positions: Array,
     stale: Array,
 ) -> int:
-    """Find the rocks whose pose has to be set: the awake ones, and all that are not where they were last.
+    """Find the rocks that are not where they were last.
 
     Reads:
-        status: (n,) of the rocks.
+        candidates: (m,) rocks that may be among them.
         quaternions, positions: (n, 4), (n, 3) [m].
     Writes:
         posed_quaternions, posed_positions: (n, 4), (n, 3) at least, those of the last call.
@@ -89,8 +88,8 @@ def find_stale(
         their number.
     """
     n_stale = 0
-    for i in range(len(status)):
-        moved = status[i] == AWAKE
+    for s in range(len(candidates)):
+        i, moved = candidates[s], False
         for d in range(4):
             if posed_quaternions[i, d] != quaternions[i, d]:
                 posed_quaternions[i, d] = quaternions[i, d]

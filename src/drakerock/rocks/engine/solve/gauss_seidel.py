@@ -37,7 +37,12 @@ from drakerock.rocks.engine.solve.machine_rows import (
     solve_machine_contacts,
     solve_machine_rows,
 )
-from drakerock.rocks.engine.solve.rows import ContactRows, apply_impulses, sum_normal_impulses
+from drakerock.rocks.engine.solve.rows import (
+    ContactRows,
+    apply_impulses,
+    clear_marks,
+    sum_normal_impulses,
+)
 
 # Contacts of rocks that are at most this many rocks away from one that touches the machine are its neighbourhood.
 NEIGHBOURHOOD = 2
@@ -90,15 +95,14 @@ def _find_machine_rows(n_rows: int, rows: ContactRows, n_bodies: int) -> int:
 
 @kernel
 def _mark_neighbourhood(n_free: int, n_rows: int, rows: ContactRows, still: int, marks: Array) -> None:
-    """Mark the rocks in the machine's neighbourhood with 1 and more, others with 0.
+    """Mark the rocks in the machine's neighbourhood with 1 and more.
 
     Reads:
         n_free, n_rows, rows: the rocks' rows are the first, the machine's the others.
         still: number of the body that stands still.
     Writes:
-        marks: (bodies of the solve,).
+        marks: (bodies of the solve,); zero before.
     """
-    marks[:] = 0
     for k in range(n_free, n_rows):
         marks[rows.body_a[k]] = 1
     for distance in range(1, NEIGHBOURHOOD + 1):
@@ -141,7 +145,7 @@ def _make_all_batches(
             group[k] = INACTIVE
         else:
             group[k] = LOADED
-    marks[:] = 0
+    clear_marks(n_rows, rows, marks)
     n_batches, ends = 0, np.empty(3, np.int64)
     for number in range(3):
         n_chosen = 0
@@ -271,7 +275,7 @@ def solve_contacts(
         velocity: (v,) its free velocities, without the warm start; changed.
         batches: room for as many rows.
         single: (n + 1) zero, and left so.
-        marks: (bodies of the solve,) scratch.
+        marks: (bodies of the solve,) zero, and left so.
 
     Returns:
         the residual, which is the last whole iteration's change of the normal impulses over their sum, or over the

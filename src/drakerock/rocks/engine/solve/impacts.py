@@ -18,7 +18,7 @@ from drakerock.rocks.engine.solve.machine_rows import (
     calc_body_velocities,
     solve_machine_contacts,
 )
-from drakerock.rocks.engine.solve.rows import ContactRows, solve_contact
+from drakerock.rocks.engine.solve.rows import ContactRows, clear_marks, solve_contact
 
 
 @kernel
@@ -34,8 +34,7 @@ def _calc_approach(rows: ContactRows, k: int, bodies: Array, machine_bodies: Arr
 def _mark_impacts(
     n_rows: int, rows: ContactRows, bodies: Array, machine_bodies: Array, law: ContactLaw, marks: Array
 ) -> None:
-    """Mark the bodies of pairs that have an impact with 1, others with 0; what stands still takes no part."""
-    marks[:] = 0
+    """Mark the bodies of pairs that have an impact with 1; what stands still takes no part."""
     for k in range(n_rows):
         row = rows.values[k]
         if row.restitution <= 0.0:
@@ -112,13 +111,14 @@ def solve_impacts(
         rows: prepared; they are left as they were.
         bodies, velocity: before the step; changed.
         impacts: (n_rows, 3) the impacts' impulses in W [N s].
-        marks: (bodies of the solve,) scratch.
+        marks: (bodies of the solve,) zero, and left so.
     """
     machine_bodies = np.zeros(len(machine.jacobian), BODY)
     calc_body_velocities(machine, velocity, machine_bodies)
     _mark_impacts(n_rows, rows, bodies, machine_bodies, law, marks)
     chosen, saved = np.empty(n_rows, np.int64), np.empty((n_rows, 6))
     n_chosen = _make_rigid(n_rows, bodies, machine_bodies, law, marks, rows, chosen, saved)
+    clear_marks(n_rows, rows, marks)
     impacts[:n_rows] = 0.0
     n_free, scratch, scratch_body = 0, np.empty((2, 6)), np.empty(1, BODY)
     while n_free < n_chosen and rows.body_b[chosen[n_free]] < len(bodies):

@@ -190,6 +190,13 @@ def solve_contact(row: Record, body_a: Record, body_b: Record) -> float:
 
 
 @kernel
+def clear_marks(n_rows: int, rows: ContactRows, marks: Array) -> None:
+    """Set the marks (bodies of the solve,) of all bodies that rows are between to zero."""
+    for k in range(n_rows):
+        marks[rows.body_a[k]], marks[rows.body_b[k]] = 0, 0
+
+
+@kernel
 def sum_normal_impulses(n_rows: int, rows: ContactRows) -> float:
     """Return the sum of the normal impulses [N s]."""
     total = 0.0
