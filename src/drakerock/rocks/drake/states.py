@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from drakerock.rocks.engine.engine import MachineStep, NonsmoothEngine, RockArrays, StepReport
-from drakerock.rocks.engine.state import MOTION
 
 
 @dataclass(eq=False)
@@ -73,24 +72,12 @@ class RockStates:
         room = other[0].room if other else None
         if room is None:
             room = self._engine.make_room()
-            _copy(now.arrays, room)
+            self._engine.copy_to(now.arrays, room)
         elif now.report is not None and other[0].arrays.steps == number - 1:
             self._engine.write_changes(now.arrays, now.report, room)
         else:
-            _copy(now.arrays, room)
+            self._engine.copy_to(now.arrays, room)
         arrays, report = self._engine.step(now.arrays, machine, room)
-        if report.redone:
-            # The first attempt may have closed gaps that this one leaves.
-            for before, after in zip(now.arrays.cache, room.cache, strict=True):
-                after[: report.n_kept] = before[: report.n_kept]
-            room.cache.pairs[report.freed] = -1
         following = SolvedState(arrays, report, room)
         self._states = (now, following)
         return following
-
-
-def _copy(arrays: RockArrays, room: RockArrays) -> None:
-    for name in MOTION:
-        getattr(room, name)[:] = getattr(arrays, name)
-    for before, after in zip(arrays.cache, room.cache, strict=True):
-        after[: len(before)] = before

@@ -286,10 +286,12 @@ class NonsmoothEngine(RockSet):
             if result[1].n_deep == 0:
                 return result
             more = _Attempt(RETRY_FACTOR * iterations, acceleration, True, True)
+            self.copy_to(arrays, room)  # other rocks may be awake now
             result = self._try_step(arrays, machine, room, more)
             if self._has_converged(result):
                 return _mark_redone(result)
         plain = _Attempt(RETRY_FACTOR * iterations, 0.0, result is not None, True)
+        self.copy_to(arrays, room)
         result = self._try_step(arrays, machine, room, plain)
         if result is None:
             raise SimulationFailure("rocks: the contact solve gave values that are not finite")
