@@ -116,7 +116,8 @@ class ScanConfig(Config):
     file: Annotated[str, Field(description="point cloud: .ply, .las, .laz, .xyz, .txt, .asc, .pts or .csv")]
     unit: Annotated[Literal["m", "cm", "mm", "ft"], Field(description="of the file's numbers")] = "m"
     rotation_deg: Annotated[
-        tuple[float, float, float], Field(description="roll, pitch, yaw about the site's x, y, z; applied first")
+        tuple[float, float, float],
+        Field(description="roll, pitch, yaw about the site's x, y, z; applied first"),
     ] = (0.0, 0.0, 0.0)
     translation: Annotated[
         tuple[float, float, float], Field(description="then added; the brow is x = 0, the floor z = 0 [m]")
@@ -133,7 +134,8 @@ class ScanConfig(Config):
         float, Field(ge=0, le=60, description="slope of the pile along the drift beyond the cloud's edges")
     ] = 35.0
     outlier_deviations: Annotated[
-        float, Field(gt=0, description="an outlier's distance to its neighbours, in deviations above the median's")
+        float,
+        Field(gt=0, description="an outlier's distance to its neighbours, in deviations above the median's"),
     ] = 4.0
     trust: Annotated[bool, Field(description="true: no checks of unit and of which side is up")] = False
 
@@ -144,7 +146,9 @@ class ScanConfig(Config):
         matrix = np.array(self.matrix)
         turn = matrix[:3, :3] if matrix.shape == (4, 4) else np.zeros((3, 3))
         if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0.0:
-            raise ValueError("matrix must have 4 rows of 4 numbers, its upper left 3 x 3 a rotation without scale")
+            raise ValueError(
+                "matrix must have 4 rows of 4 numbers, its upper left 3 x 3 a rotation without scale"
+            )
         if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
             raise ValueError("matrix: the last row must be 0 0 0 1")
         if any(self.rotation_deg) or any(self.translation):

@@ -25,10 +25,12 @@ from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.site import make_site
 from drakerock.rocks.state import PileState, save_pile
 from drakerock.rocks.summary import calc_summary
+from drakerock.rocks.surveying.survey import survey_scan
 from drakerock.viewing.cycle_figures import write_cycle_figures
 from drakerock.viewing.pile_figures import write_pile_picture
 from drakerock.viewing.pile_page import write_pile_page
 from drakerock.viewing.replay import write_replay
+from drakerock.viewing.scan_figures import write_scan_picture
 
 # Woken rocks of a pile at rest creep no faster: 30 mm in 5 s [m/s].
 REST_SPEED = 0.006
@@ -174,7 +176,7 @@ def _summarise(values: list[float | None]) -> dict[str, Any]:
 def make_pile_files(
     scenario: Scenario, folder: Path, progress: Callable[..., None]
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Make or fetch the scenario's pile and write pile.npz, pile.json, pile.png and pile.html.
+    """Make or fetch the scenario's pile and write pile.npz, .json, .png and .html; of a scan, scan.png, too.
 
     Returns:
         The summary, and the paths written. ``at_rest`` is measured: all rocks are woken for half a second.
@@ -196,10 +198,18 @@ def make_pile_files(
         "creep_mm_p99": round(1e3 * p99, 3),
         "taken_from": str(source),
     }
+    if "scan" in pile.provenance:
+        summary |= {
+            f"scan_{name}": value for name, value in pile.provenance["scan"].items() if name != "notes"
+        }
     progress("writing", None)
     paths = [folder / name for name in ("pile.npz", "pile.json", "pile.png", "pile.html")]
     save_pile(pile, paths[0])
     write_text(paths[1], json.dumps(summary | {"provenance": pile.provenance}, indent=2) + "\n")
     write_pile_picture(pile, shapes, scenario.site, paths[2])
     write_pile_page(pile, shapes, scenario.site, paths[3])
+    if scenario.pile.scan is not None:
+        survey = survey_scan(scenario.pile.scan, scenario.site, scenario.pile, scenario.rocks)
+        write_scan_picture(survey, pile, shapes, folder / "scan.png", Path(scenario.pile.scan.file).name)
+        paths.append(folder / "scan.png")
     return summary, paths

@@ -11,7 +11,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import floor
 from pathlib import Path
@@ -33,6 +33,9 @@ from drakerock.study.work import Task, TaskResult, count_begun
 RUN_SEQUENCE = "drakerock.loading.sequence:run_sequence"
 _POLL = 0.5
 
+Ask = Callable[[Store], Array]
+"""Says which points (n, d) a study needs next, from what is stored; none: no more."""
+
 
 def run_study(
     study: StudyConfig,
@@ -42,6 +45,7 @@ def run_study(
     scheduler: str | None = None,
     display: Display | None = None,
     work: str = RUN_SEQUENCE,
+    ask: Ask | None = None,
 ) -> dict[str, Any]:
     """Run a study to its end, or go on with one that was interrupted; write the response tables.
 
@@ -54,6 +58,7 @@ def run_study(
         workers, scheduler: instead of the study's executor settings.
         display: shows what goes on; None: nothing.
         work: the function that runs a sequence, as ``module:name``.
+        ask: says where to sample next, instead of the study's sampler; called when all points so far have ended.
 
     Returns:
         The status at the end (`read_status`).
@@ -64,7 +69,7 @@ def run_study(
         KeyboardInterrupt: Ctrl-C, once the running cycles are finished or given up.
     """
     with Store.create(folder, study) as store:
-        runner = _Runner(store, display, work)
+        runner = _Runner(store, display, work, ask)
         try:
             runner.run(workers, scheduler)
         finally:
@@ -78,9 +83,10 @@ def run_study(
 class _Runner:
     """One run of a study."""
 
-    def __init__(self, store: Store, display: Display | None, work: str) -> None:
+    def __init__(self, store: Store, display: Display | None, work: str, ask: Ask | None = None) -> None:
         self._store, self._study = store, store.study
         self._display, self._work = display, work
+        self._ask_store = ask or self._ask
         self._running: dict[str, _Sequence] = {}
         self._lost: deque[_Sequence] = deque()
         self._stop_file = store.folder / f".stop-{time.time_ns()}"
@@ -173,18 +179,21 @@ class _Runner:
             validation = store.list_points("validation")
         samples = store.list_points("sample")
         if len(samples) < config.n_samples and all(p.status in ("done", "failed") for p in samples):
-            store.add_points("sample", _next_batch(samples), self._ask(len(samples)))
-            samples = store.list_points("sample")
+            more = self._ask_store(store)
+            if len(more):
+                store.add_points("sample", _next_batch(samples), more)
+                samples = store.list_points("sample")
         # A study resumed with fewer points leaves the rest be.
         wanted = samples[: config.n_samples] + validation[: config.n_validation]
         return [point for point in wanted if point.status not in ("done", "failed")]
 
-    def _ask(self, n_samples: int) -> Array:
+    def _ask(self, store: Store) -> Array:
+        n_samples = len(store.list_points("sample"))
         config = self._study.exploration.sampling
         sampler = make_sampler(self._study.problem, config, self._study.seed)
         if n_samples == 0:
             return sampler.ask(min(len(sampler.initial), config.n_samples))
-        table = read_responses(self._store, "sample")
+        table = read_responses(store, "sample")
         sampler.tell(table.X, table.Y, table.noise)
         # Of an initial design cut short by an earlier, smaller number of points, the rest comes first.
         left = len(sampler.initial) - n_samples

@@ -123,6 +123,55 @@ class ExecutorConfig(Config):
     slurm: SlurmConfig = SlurmConfig()
 
 
+class CurveConfig(Config):
+    """One measured curve: which signal it is compared with, over what, and how well it is known."""
+
+    signal: Annotated[
+        str,
+        Field(description="a column of signals.parquet; or profile: the mean height of the pile that is dug"),
+    ]
+    over: Annotated[
+        str, Field(description="the signal on the abscissa, such as time or x_T; of a profile: x")
+    ] = "time"
+    column: Annotated[
+        str | None, Field(description="the measured values' column; null: called as the signal")
+    ] = None
+    over_column: Annotated[
+        str | None, Field(description="the measured abscissae's column; null: as over")
+    ] = None
+    noise: Annotated[
+        float | None,
+        Field(
+            gt=0, description="standard deviation of a value, in the signal's SI unit; null: from its scatter"
+        ),
+    ] = None
+    model_error: Annotated[
+        float,
+        Field(ge=0, description="by how much a bin's mean may differ besides: what the model leaves out"),
+    ] = 0.0
+    shift: Annotated[float, Field(description="added to the measured abscissae, in SI: another zero")] = 0.0
+
+    @property
+    def measured(self) -> str:
+        """The measured values' column."""
+        return self.column or self.signal
+
+    @property
+    def measured_over(self) -> str:
+        """The measured abscissae's column."""
+        return self.over_column or self.over
+
+
+class CalibrationConfig(Config):
+    """What `drakerock calibrate` fits the study's variables to. Has no influence on what one point yields."""
+
+    curves: Annotated[tuple[CurveConfig, ...], Field(min_length=1)]
+    bins: Annotated[
+        int, Field(ge=3, le=500, description="a curve is compared by the means of so many parts")
+    ] = 24
+    confidence: Annotated[float, Field(gt=0.5, lt=1, description="probability of the intervals")] = 0.95
+
+
 class StorageConfig(Config):
     """What stays of a finished sequence."""
 
@@ -164,6 +213,9 @@ class StudyConfig(Config):
         bool, Field(description="each point has a seed and thus an original pile of its own")
     ] = False
     exploration: ExplorationConfig = ExplorationConfig()
+    calibration: Annotated[
+        CalibrationConfig | None, Field(description="measured curves that the variables are fitted to")
+    ] = None
     failures: FailureConfig = FailureConfig()
     executor: ExecutorConfig = ExecutorConfig()
     storage: StorageConfig = StorageConfig()
@@ -263,6 +315,7 @@ class StudyConfig(Config):
             executor=ExecutorConfig(),
             storage=StorageConfig(),
             exploration=ExplorationConfig(sampling=sampling),
+            calibration=None,
         )
 
 

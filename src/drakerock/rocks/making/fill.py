@@ -44,8 +44,8 @@ FOOTPRINT = 0.42
 # A layer of rain has so long to fall [s]; corrections, of single rocks, so long.
 LAYER_TIME = 0.4
 CORRECTION_TIME = 1.0
-# So many layers at most, and so many without room for a rock, and it has rained enough.
-MAX_LAYERS, MISSED_LAYERS = 80, 2
+# So many layers at most; it has rained enough when so many have not brought the share of what was to be filled.
+MAX_LAYERS, VAIN_LAYERS, LAYER_SHARE = 80, 4, 0.01
 # Rounds of corrections in all; and as many end it as have brought nothing.
 MAX_CORRECTIONS, VAIN_CORRECTIONS = 24, 5
 # A rock whose middle is so far above the surface, in its widths, has rolled out of the measured volume.
@@ -98,11 +98,16 @@ def fill_surface(
     rms, bias = calc_rms(filling.view(pile).h, survey.surface)
     if rms > wanted:
         _log.warning(
-            "pile.scan: the rocks' surface differs from the scan's by %.2f m rms, more than half a median rock (%.2f m): "
+            "pile.scan: the rocks' surface is %.2f m rms off the scan's, more than half a median rock (%.2f m): "
             "rocks of this gradation do not stand as the scan does", rms, wanted,
         )  # fmt: skip
     pile = pile.select(order_by_place(pile.p_WRs))
-    result = {"rms_m": round(rms, 4), "bias_m": round(bias, 4), "wanted_m": wanted, "reached": bool(rms <= wanted)}
+    result = {
+        "rms_m": round(rms, 4),
+        "bias_m": round(bias, 4),
+        "wanted_m": wanted,
+        "reached": bool(rms <= wanted),
+    }
     return replace(pile, V_WRs=np.zeros_like(pile.V_WRs)), result
 
 
@@ -110,17 +115,24 @@ def _announce_number(survey: Survey, shapes: tuple[RockShape, ...], recipe: Pile
     number = round(PACKING * survey.surface.volume / calc_mean_volume(recipe.rocks, shapes))
     if number > MAX_ROCKS:
         raise InputError(
-            f"pile.scan: {survey.surface.volume:.0f} m3 of this gradation are about {number} rocks; at most {MAX_ROCKS} "
-            "are allowed: make the rocks larger, or cut the scan"
+            f"pile.scan: {survey.surface.volume:.0f} m3 of this gradation are about {number} rocks; at most "
+            f"{MAX_ROCKS} are allowed: make the rocks larger, or cut the scan"
         )
-    _log.warning("drakerock: filling the scan's %.1f m3 with about %d rocks (once)", survey.surface.volume, number)
+    _log.warning(
+        "drakerock: filling the scan's %.1f m3 with about %d rocks (once)", survey.surface.volume, number
+    )
 
 
 class _Filling:
     """The steps of the filling, each from a pile to a pile."""
 
     def __init__(
-        self, survey: Survey, shapes: tuple[RockShape, ...], recipe: PileRecipe, rng: np.random.Generator, tell: Progress
+        self,
+        survey: Survey,
+        shapes: tuple[RockShape, ...],
+        recipe: PileRecipe,
+        rng: np.random.Generator,
+        tell: Progress,
     ) -> None:
         self._surface, self._shapes, self._recipe, self._rng = survey.surface, shapes, recipe, rng
         self._tell = tell
@@ -134,27 +146,30 @@ class _Filling:
 
     def rain(self, pile: PileState) -> PileState:
         """Let rocks rain, layer by layer, until none finds room below the surface."""
-        target, missed = self._surface.h, 0
-        first = float(np.sum(np.maximum(target - self.view(pile).h, 0.0)))
+        target = self._surface.h
+        lacks: list[float] = []
         for layer in range(MAX_LAYERS):
             lack = target - self.view(pile).h
+            lacks.append(float(np.sum(np.maximum(lack, 0.0))))
+            if layer >= VAIN_LAYERS and lacks[-1 - VAIN_LAYERS] - lacks[-1] < LAYER_SHARE * lacks[0]:
+                break
+            self._tell(f"layer {layer + 1}", 0.6 * (1.0 - lacks[-1] / max(lacks[0], 1e-9)))
             placer = Placer(pile, self._shapes, self._site, self._rng)
             shares = ShareKeeper(pile, self._recipe.rocks)
             lack = lack.ravel().copy()
             for cell in self._rng.permutation(np.flatnonzero(lack > RISE * self._sizes[0])):
                 self._rain_on(cell, lack, placer, shares)
-            missed = 0 if placer.count else missed + 1
-            if missed > MISSED_LAYERS:
+            if not placer.count:
                 break
             pile = self._fall(pile.join(placer.make_rocks()), LAYER_TIME)
-            left = float(np.sum(np.maximum(target - self.view(pile).h, 0.0)))
-            self._tell(f"layer {layer + 1}", 0.6 * (1.0 - min(left / max(first, 1e-9), 1.0)))
         return pile
 
     def _rain_on(self, cell: int, lack: Array, placer: Placer, shares: ShareKeeper) -> None:
         place = self._cells[cell] + self._surface.cell * self._rng.uniform(-0.5, 0.5, 2)
         distance = np.linalg.norm(self._cells - place, axis=1)
-        room = np.array([lack[distance <= max(FOOTPRINT * s, 0.75 * self._surface.cell)].mean() for s in self._sizes])
+        room = np.array(
+            [lack[distance <= max(FOOTPRINT * s, 0.75 * self._surface.cell)].mean() for s in self._sizes]
+        )
         size = shares.choose(self._sizes[room >= RISE * self._sizes])
         if size is None or not placer.place(place, size):
             return

@@ -43,13 +43,11 @@ class ShareKeeper:
 
 
 class Placer:
-    """Puts rocks in the air above a pile, so that no bounding sphere meets another, the floor, a wall or the roof.
+    """Puts rocks in the air above a pile, so that no bounding sphere meets another, the floor, a wall or the roof."""
 
-    Attributes:
-        count: rocks placed so far.
-    """
-
-    def __init__(self, pile: PileState, shapes: tuple[RockShape, ...], site: Site, rng: np.random.Generator) -> None:
+    def __init__(
+        self, pile: PileState, shapes: tuple[RockShape, ...], site: Site, rng: np.random.Generator
+    ) -> None:
         self._shapes, self._rng = shapes, rng
         radii = np.array([shape.radius for shape in shapes])
         n = len(pile)
@@ -62,6 +60,7 @@ class Placer:
 
     @property
     def count(self) -> int:
+        """Number of rocks placed so far."""
         return len(self._kinds)
 
     def place(self, place: Array, size: float) -> bool:

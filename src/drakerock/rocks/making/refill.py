@@ -28,8 +28,8 @@ def refill(
     """Return the pile without the removed rocks, new ones emitted from above until its level is restored, at rest.
 
     The new rocks have the removed ones' shapes and sizes, so that the gradation stays over a long sequence. With
-    `pile.rocks` or `pile.scan` set, all are emitted and their number stays too; those that find no room, because the pile reaches
-    up to the emitter, wait for the next refill (in the provenance). With null, the void is filled to the emitter
+    `pile.rocks` or `pile.scan` set, all are emitted and their number stays too; those that find no room, because the
+    pile reaches up to the emitter, wait for the next refill (in the provenance). Else, the void is filled to the emitter
     again: none is emitted while the void's level has not sunk, and further ones are drawn when the pile has slid.
 
     Args:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -51,7 +52,7 @@ def _read_ply(path: Path) -> Array:
     return points
 
 
-def import_laspy() -> object:
+def import_laspy() -> Any:
     """Return laspy, which the extra ``scan`` installs; InputError if it is not there."""
     try:
         import laspy
@@ -65,7 +66,7 @@ def import_laspy() -> object:
 def _read_las(path: Path) -> Array:
     laspy = import_laspy()
     try:
-        points = np.asarray(laspy.read(path).xyz, float).reshape(-1, 3)  # type: ignore[attr-defined]
+        points = np.asarray(laspy.read(path).xyz, float).reshape(-1, 3)
     except Exception as error:
         raise InputError(f"{path}: not a readable LAS or LAZ file: {error}") from None
     return points
@@ -85,10 +86,14 @@ def _read_text(path: Path) -> Array:
             break
         skip += 1
         if len(cells) >= 3:
-            header = [cell.strip("#\"' ").partition("[")[0].partition("(")[0].strip().casefold() for cell in cells]
+            header = [
+                cell.strip("#\"' ").partition("[")[0].partition("(")[0].strip().casefold() for cell in cells
+            ]
             header = [cell for cell in header if cell]
     else:
-        raise InputError(f"{path}: no line with three numbers among the first 50; needed are x, y, z in columns")
+        raise InputError(
+            f"{path}: no line with three numbers among the first 50; needed are x, y, z in columns"
+        )
     columns = tuple(next((header.index(name) for name in names if name in header), k)
                     for k, names in enumerate(_HEADERS))  # fmt: skip
     row = lines[skip]
@@ -96,10 +101,11 @@ def _read_text(path: Path) -> Array:
     if separator == ";" and re.search(r"\d,\d", row):
         raise InputError(f"{path}: line {skip + 1} has decimal commas; write decimal points")
     try:
-        return np.loadtxt(
+        points: Array = np.loadtxt(
             path, delimiter=separator, skiprows=skip, usecols=columns, ndmin=2, encoding="utf-8-sig",
             converters=lambda cell: float(cell) if cell.strip() else np.nan,
         )  # fmt: skip
+        return points
     except (ValueError, IndexError) as error:
         raise InputError(f"{path}: not three columns of numbers: {error}") from None
 

@@ -50,7 +50,9 @@ class Surface:
         return float(self.h.sum()) * self.cell**2
 
 
-def make_surface(points: Array, site: SiteConfig, pile: PileConfig, scan: ScanConfig) -> tuple[Surface, list[str]]:
+def make_surface(
+    points: Array, site: SiteConfig, pile: PileConfig, scan: ScanConfig
+) -> tuple[Surface, list[str]]:
     """Return the height field of a cloud, complete over the pile's drift and void, and what was inferred.
 
     A cell's height is the median of its points'. Holes no wider than `scan.max_hole` are filled linearly. Beyond the
@@ -90,7 +92,9 @@ def make_surface(points: Array, site: SiteConfig, pile: PileConfig, scan: ScanCo
         raise InputError(_describe_hole(grid, wide, scan, cell))
     h = np.where(inside, linear, h)
     if inside.any():
-        notes.append(f"{inside.sum() * cell**2:.2f} m2 without points filled linearly between their neighbours")
+        notes.append(
+            f"{inside.sum() * cell**2:.2f} m2 without points filled linearly between their neighbours"
+        )
     outside = ~seen & ~inside
     near_h, near_x = h[tuple(nearest)], x[nearest[0]]
     slope = np.tan(np.deg2rad(scan.edge_slope_deg))
@@ -104,7 +108,7 @@ def make_surface(points: Array, site: SiteConfig, pile: PileConfig, scan: ScanCo
             f"{beyond.sum() * cell**2:.1f} m2 beyond the cloud's edges inferred: level to the sides, "
             f"{scan.edge_slope_deg:g} deg along the drift"
         )
-    return Surface(x, y, np.maximum(h, 0.0), seen, cell), notes
+    return Surface(np.asarray(x, float), y, np.maximum(h, 0.0), seen, cell), notes
 
 
 def _describe_hole(grid: Array, wide: Mask, scan: ScanConfig, cell: float) -> str:
@@ -112,8 +116,8 @@ def _describe_hole(grid: Array, wide: Mask, scan: ScanConfig, cell: float) -> st
     sizes = np.bincount(parts.ravel())[1:]
     centre = grid[parts == 1 + int(np.argmax(sizes))].mean(axis=0)
     return (
-        f"{count} hole{'s' if count > 1 else ''} wider than pile.scan.max_hole = {scan.max_hole:g} m, the largest around "
-        f"x = {centre[0]:.2f}, y = {centre[1]:.2f} m; scan again from another side, or raise max_hole"
+        f"{count} hole{'s' if count > 1 else ''} wider than pile.scan.max_hole = {scan.max_hole:g} m, the largest "
+        f"around x = {centre[0]:.2f}, y = {centre[1]:.2f} m; scan again from another side, or raise max_hole"
     )
 
 
@@ -143,7 +147,8 @@ def view_pile(pile: PileState, shapes: tuple[RockShape, ...], surface: Surface) 
     offsets = surface.cell * ((np.arange(RAYS) + 0.5) / RAYS - 0.5)
     grid = np.stack(
         np.broadcast_arrays(
-            surface.x[:, None, None, None] + offsets[:, None], surface.y[None, :, None, None] + offsets[None, :]
+            surface.x[:, None, None, None] + offsets[:, None],
+            surface.y[None, :, None, None] + offsets[None, :],
         ),
         axis=-1,
     )

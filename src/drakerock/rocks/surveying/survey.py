@@ -83,7 +83,9 @@ def survey_scan(scan: ScanConfig, site: SiteConfig, pile: PileConfig, rocks: Roc
         raise InputError(text if scan.file in text else f"{scan.file}: {text}") from None
 
 
-def _survey(points: Array, scan: ScanConfig, site: SiteConfig, pile: PileConfig, rocks: RocksConfig) -> Survey:
+def _survey(
+    points: Array, scan: ScanConfig, site: SiteConfig, pile: PileConfig, rocks: RocksConfig
+) -> Survey:
     notes = list[str]()
 
     def keep(mask: Mask, what: str) -> None:
@@ -133,7 +135,9 @@ def _survey(points: Array, scan: ScanConfig, site: SiteConfig, pile: PileConfig,
     surface, more = make_surface(points, site, pile, scan)
     height, median = float(surface.h[surface.seen].max()), calc_median_rock(rocks)
     if height < median:
-        raise InputError(f"the scan shows no pile: it is {height:.2f} m high, and the median rock is {median:g} m wide")
+        raise InputError(
+            f"the scan shows no pile: it is {height:.2f} m high, and the median rock is {median:g} m wide"
+        )
     return Survey(points, surface, notes + more)
 
 
@@ -145,7 +149,9 @@ def _check_unit(points: Array, site: SiteConfig, scan: ScanConfig) -> None:
         hint = "it may be in millimetres (pile.scan.unit: mm)" if scan.unit == "m" else "check pile.scan.unit"
         raise InputError(f"the cloud is {extent:.4g} m long, the site {longest:.4g} m; {hint}")
     if extent < TOO_SHORT:
-        raise InputError(f"the cloud is {extent:.2g} m long, less than a rock; check pile.scan.unit ({scan.unit})")
+        raise InputError(
+            f"the cloud is {extent:.2g} m long, less than a rock; check pile.scan.unit ({scan.unit})"
+        )
 
 
 def _check_upright(points: Array) -> None:
