@@ -383,6 +383,25 @@ def study_report(
     _print_paths(paths)
 
 
+@study_app.command("tornado")
+def study_tornado(
+    folder: StudyFolder,
+    out: Annotated[Path | None, typer.Option(help="Folder to write into [default: DIR].")] = None,
+    json_: JsonOption = False,
+) -> None:
+    """Draw what each variable changes of each objective, of a study that varies one thing at a time.
+
+    Example: drakerock study tornado out/sensitivity
+    """
+    from drakerock.study.tornado import run_tornado
+
+    rows, paths = run_tornado(folder, out)
+    if json_:
+        print(json.dumps(rows))
+    else:
+        _print_paths(paths)
+
+
 @study_app.command("confirm")
 def study_confirm(
     folder: StudyFolder,

@@ -130,7 +130,7 @@ def _fit(
 
 
 def read_curves(store: Store, curves: list[MeasuredCurve]) -> tuple[Array, Array]:
-    """Return the finished points (n, d) and their curves' bins in line (n, b): means over loadings; NaN: not reached."""
+    """Return the finished points (n, d) and their curves' bins in line (n, b); NaN: not reached."""
     X, rows = [], []
     for point in store.list_points("sample"):
         if point.status != "done":

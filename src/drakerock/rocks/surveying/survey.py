@@ -25,9 +25,9 @@ LEAST_POINTS = 100
 TOO_LONG, TOO_SHORT = 20.0, 0.5
 # Points so far below the floor are wrong; a few are outliers, more mean a wrong alignment.
 BELOW_FLOOR, MANY_BELOW = 0.3, 0.02
-# A cloud is taken to be upside down when so large a share of its points lies within this of its highest ones [m],
-# and less than the second share within this of its lowest.
-FLAT, FLAT_ABOVE, FLAT_BELOW = 0.05, 0.3, 0.03
+# A cloud is taken to be upside down when so large a share of its points lies within this of its highest ones [m], as
+# those of a floor do, and less than this part of that share within this of its lowest.
+FLAT, FLAT_SHARE, FLAT_RATIO = 0.05, 0.3, 0.25
 # Points so near to roof or walls are theirs [m].
 LINING = 0.1
 # An outlier is judged by its distance to so many neighbours; more outliers than the share are no outliers any more.
@@ -164,7 +164,7 @@ def _check_upright(points: Array) -> None:
         )
     low, high = np.percentile(z, [0.5, 99.5])
     above, beneath = float(np.mean(z > high - FLAT)), float(np.mean(z < low + FLAT))
-    if high - low > FLOOR_HEIGHT and above > FLAT_ABOVE and beneath < FLAT_BELOW:
+    if high - low > FLOOR_HEIGHT and above > FLAT_SHARE and beneath < FLAT_RATIO * above:
         raise InputError(
             f"{100 * above:.0f} % of the points lie in the plane of the highest ones, as the floor would of a cloud "
             "that is upside down (pile.scan.rotation_deg: [180, 0, 0]); pile.scan.trust: true if it is not"
