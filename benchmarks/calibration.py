@@ -27,7 +27,7 @@ ANGLE, TORQUE, FORCE = 0.002, 5e3, 5e3
 
 
 def measure(study, path):
-    """Write the measurement: boom angle [deg] and torque [kN m] over time [ms], push force [kN] over the tip's place [m]."""
+    """Write the measurement: boom angle [deg] and torque [kN m] over time [ms], push force [kN] over place [m]."""
     scenario = study.make_scenario(np.array([PLANTED[v.name] for v in study.variables]), "planted")
     signals = run_cycle(scenario, get_pile(scenario)).signals
     rng = np.random.default_rng(11)

@@ -1,10 +1,10 @@
-"""A stand-in for the simulation whose curves are known functions of density and friction; with `run_sequence`'s contract."""
+"""A stand-in for the simulation whose curves are known functions of density and friction."""
 
 from __future__ import annotations
 
 import numpy as np
-import study_work
 
+import study_work
 from drakerock.loading.signal_table import save_signals
 from drakerock.randomness import make_generator
 

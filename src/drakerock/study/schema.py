@@ -48,9 +48,9 @@ class Choice(Config):
     """One setting of a variable that is no number: scenario keys and their values."""
 
     label: str
-    set: Annotated[
-        dict[str, Any], Field(description="values by dotted scenario key; {}: the scenario as it is")
-    ] = {}
+    set: dict[str, Any] = Field(
+        default={}, description="values by dotted scenario key; {}: the scenario as it is"
+    )
 
 
 class StudyVariable(Variable):

@@ -1,10 +1,9 @@
-"""Filling a measured surface: rocks placed apart, shares kept, and a small heap that comes out at rest and as wanted."""
+"""Filling a measured surface: rocks placed apart, shares kept, a small heap that comes out at rest and as wanted."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from rock_helpers import make_pile
 
 from drakerock.randomness import make_generator
 from drakerock.rocks.config import RocksConfig, SiteConfig
@@ -15,6 +14,7 @@ from drakerock.rocks.making.settle import calc_creep
 from drakerock.rocks.site import make_site
 from drakerock.rocks.surveying.surface import calc_rms, view_pile
 from drakerock.rocks.surveying.survey import survey_scan
+from rock_helpers import make_pile
 
 SITE = SiteConfig(drift_width=4.0, void_depth=1.0, rear_layer=0.0, drift_length=10.0)
 

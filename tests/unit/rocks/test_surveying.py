@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from rock_helpers import make_box, make_pile
 
 from drakerock.errors import InputError
 from drakerock.rocks.config import PileConfig, RocksConfig, ScanConfig, SiteConfig
@@ -13,6 +12,7 @@ from drakerock.rocks.surveying import files
 from drakerock.rocks.surveying.cloud import read_cloud
 from drakerock.rocks.surveying.surface import Surface, calc_rms, view_pile
 from drakerock.rocks.surveying.survey import calc_median_rock, survey_scan
+from rock_helpers import make_box, make_pile
 
 SITE = SiteConfig(drift_width=6.0, void_depth=1.0, rear_layer=0.0, drift_length=20.0)
 

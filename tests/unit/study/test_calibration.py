@@ -1,14 +1,14 @@
-"""Calibration from file to result with a stand-in simulation: measured files as they come, planted values, resumption."""
+"""Calibration from file to result with a stand-in simulation: files as they come, planted values, resumption."""
 
 from __future__ import annotations
 
 import json
 
-import calibration_work
 import numpy as np
 import pytest
-import study_work
 
+import calibration_work
+import study_work
 from drakerock.config import parse_config
 from drakerock.errors import InputError
 from drakerock.study.calibration import SIGNAL_UNITS, run_calibration

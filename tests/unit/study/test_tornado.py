@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 
 import pytest
-import study_work
 
+import study_work
 from drakerock.config import parse_config
 from drakerock.errors import InputError
 from drakerock.study.runner import run_study

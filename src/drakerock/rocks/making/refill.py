@@ -30,7 +30,8 @@ def refill(
     The new rocks have the removed ones' shapes and sizes, so that the gradation stays over a long sequence. With
     `pile.rocks` or `pile.scan` set, all are emitted and their number stays too; those that find no room, because the
     pile reaches up to the emitter, wait for the next refill (in the provenance). Else, the void is filled to the
-    emitter again: none is emitted while the void's level has not sunk, and further ones are drawn when the pile has slid.
+    emitter again: none is emitted while the void's level has not sunk, and further ones are drawn when the pile has
+    slid.
 
     Args:
         pile: all rocks, the removed ones among them.
