@@ -1,9 +1,9 @@
-"""Are planted parameters found again? One simulation with known parameters and a pile of its own is "measured".
+"""Are planted parameters found again? One simulation with known parameters is "measured", in a pile that is known, too.
 
     python benchmarks/calibration.py --out out/calibration
 
 The measurement has noise, other column names and units than the simulation, uneven sampling, a gap and empty cells.
-Then `drakerock calibrate` gets it. Stored as docs/validation/calibration.json and calibration.png.
+Then `drakerock calibrate` gets it, and digs in the same pile, as in one that was scanned.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from drakerock.loading.cycle import run_cycle
+from drakerock.rocks.state import save_pile
 from drakerock.study.calibration import run_calibration
 from drakerock.study.jobs import get_pile
 from drakerock.study.schema import load_study
@@ -57,7 +58,10 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("out/calibration"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    study, measured = load_study(STUDY), options.out / "measured.csv"
+    pile, measured = options.out / "pile.npz", options.out / "measured.csv"
+    if not pile.exists():
+        save_pile(get_pile(load_study(STUDY).scenario), pile)
+    study = load_study(STUDY, [f"scenario.pile.source={json.dumps(str(pile.resolve()))}"])
     begin = time.process_time()
     if not measured.exists():
         measure(study, measured)

@@ -19,7 +19,9 @@ from drakerock.study.survey import make_scan_overrides, write_survey
 def test_alignment_in_its_own_file(tmp_path):
     path = tmp_path / "align.yaml"
     path.write_text("unit: mm\nrotation_deg: [0, 0, 90]\n")
-    scenario = load_scenario(overrides=["pile.rocks=300", *make_scan_overrides(tmp_path / "a scan.ply", path)])
+    scenario = load_scenario(
+        overrides=["pile.rocks=300", *make_scan_overrides(tmp_path / "a scan.ply", path)]
+    )
     scan = scenario.pile.scan
     assert scan is not None
     assert (scan.file, scan.unit, scan.rotation_deg) == (str(tmp_path / "a scan.ply"), "mm", (0, 0, 90))
