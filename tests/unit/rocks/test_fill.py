@@ -20,7 +20,7 @@ SITE = SiteConfig(drift_width=4.0, void_depth=1.0, rear_layer=0.0, drift_length=
 
 
 def test_placed_rocks_touch_nothing(shapes):
-    there = make_pile([[-2.0, 0.0, 0.4], [-2.0, 0.7, 0.4]], size=np.array([0.6, 0.6]))
+    there = make_pile([[-2.0, 0.0, 0.4], [-2.0, 1.0, 0.4]], size=np.array([0.6, 0.6]))
     placer = Placer(there, shapes, make_site(SITE), make_generator(0))
     for place in np.random.default_rng(0).uniform([-4, -2], [1, 2], (200, 2)):
         placer.place(place, 0.4)
