@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drakerock.errors import InputError
 from drakerock.exploration.config import SamplingConfig
 from drakerock.exploration.problem import Array, Problem
-from drakerock.exploration.table import ResponseTable
+
+if TYPE_CHECKING:  # schemas make designs, and the table brings pyarrow
+    from drakerock.exploration.table import ResponseTable
 
 
 @dataclass(frozen=True)
