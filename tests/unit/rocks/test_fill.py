@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drakerock.randomness import make_generator
 from drakerock.rocks.config import RocksConfig, SiteConfig
@@ -30,7 +31,11 @@ def test_placed_rocks_touch_nothing(shapes):
     radii = np.array([shape.radius for shape in shapes])[every.shape] * every.size
     apart = np.linalg.norm(every.p_WRs[:, None] - every.p_WRs[None], axis=2)
     assert (apart + 1e-9 >= radii[:, None] + radii[None])[np.triu_indices(len(every), 1)].all()
-    assert (np.abs(rocks.p_WRs[:, 1]) <= 2.0 - radii[2:]).all()
+    for rock in range(len(rocks)):
+        turn = Rotation.from_quat(rocks.q_WRs[rock], scalar_first=True)
+        corners = rocks.p_WRs[rock] + turn.apply(rocks.size[rock] * shapes[rocks.shape[rock]].vertices)
+        assert np.abs(corners[:, 1]).max() < 2.0
+        assert corners[:, 0].max() < 1.0
     # On what lies below, not in the air: over bare floor at the floor.
     assert rocks.p_WRs[:, 2].min() == pytest.approx(radii[2 + rocks.p_WRs[:, 2].argmin()] + 0.01)
 

@@ -64,11 +64,13 @@ class Placer:
         return len(self._kinds)
 
     def place(self, place: Array, size: float) -> bool:
-        """Place a rock of that sieve width over `place` (2,), beside all placed before; False if there is no room."""
+        """Place a rock of that sieve width over (or, at a wall, near) `place` (2,); False if there is no room."""
         if self._n == len(self._spheres):
             return False
         shape = int(self._rng.integers(len(self._shapes)))
         radius = self._shapes[shape].radius * size
+        turn = Rotation.random(rng=self._rng)
+        place = self._move_off_walls(place, turn.apply(size * self._shapes[shape].vertices))
         spheres = self._spheres[: self._n]
         apart = np.sum((spheres[:, :2] - place) ** 2, axis=1)
         reach = spheres[:, 3] + radius
@@ -76,20 +78,24 @@ class Placer:
         # One layer: not on top of a rock that has just been placed.
         if near[self._first :].any():
             return False
-        floor = radius
-        top = float(np.max(spheres[near, 2] + np.sqrt(reach[near] ** 2 - apart[near]), initial=floor))
+        top = float(np.max(spheres[near, 2] + np.sqrt(reach[near] ** 2 - apart[near]), initial=radius))
         centre = np.array([*place, top + AIR])
-        if not self._is_free(centre, radius):
+        # The roof's and the taper's pieces are kept off by the bounding sphere, the walls by the corners.
+        if not all(np.max(piece[:, :3] @ centre + piece[:, 3]) >= radius for piece in self._pieces):
             return False
         self._spheres[self._n] = *centre, radius
         self._n += 1
-        self._kinds.append((shape, size, Rotation.random(rng=self._rng).as_quat(scalar_first=True)))
+        self._kinds.append((shape, size, turn.as_quat(scalar_first=True)))
         return True
 
-    def _is_free(self, centre: Array, radius: float) -> bool:
-        if np.any(self._planes[:, :3] @ centre - self._planes[:, 3] < radius):
-            return False
-        return all(np.max(piece[:, :3] @ centre + piece[:, 3]) >= radius for piece in self._pieces)
+    def _move_off_walls(self, place: Array, corners: Array) -> Array:
+        """Return the place (2,) moved so far off the upright walls that a rock's corners (k, 3) about it clear them."""
+        moved = place.copy()
+        for *normal, offset in self._planes:
+            if abs(normal[2]) < 0.5:
+                inside = float(np.min(corners @ normal)) + float(np.dot(normal[:2], moved)) - offset
+                moved += max(AIR - inside, 0.0) * np.array(normal[:2])
+        return moved
 
     def make_rocks(self) -> PileState:
         """Return the placed rocks, on their way down."""
