@@ -48,6 +48,8 @@ CORRECTION_TIME = 1.0
 MAX_LAYERS, VAIN_LAYERS, LAYER_SHARE = 80, 4, 0.01
 # Rounds of corrections in all; and as many end it as have brought nothing.
 MAX_CORRECTIONS, VAIN_CORRECTIONS = 24, 5
+# Corrected and brought to rest so often at most, each time from the best so far.
+MAX_ATTEMPTS = 6
 # A rock whose middle is so far above the surface, in its widths, has rolled out of the measured volume.
 OUT = 0.35
 # A correction must bring so much, as sum over cells of squared differences [m^2].
@@ -85,9 +87,9 @@ def fill_surface(
     pile = filling.rain(pile)
     best: tuple[float, PileState] | None = None
     wanted = 0.5 * calc_median_rock(recipe.rocks)
-    for attempt in range(3):
-        pile = filling.correct(pile, 0.7 * wanted if attempt else 0.6 * wanted)
-        pile = filling.rest(pile)
+    for attempt in range(MAX_ATTEMPTS):
+        start = best[1] if best else pile
+        pile = filling.rest(filling.correct(start, (0.6 if attempt % 2 else 0.7) * wanted))
         rms = calc_rms(filling.view(pile).h, survey.surface)[0]
         if best is None or rms < best[0]:
             best = rms, pile
