@@ -85,22 +85,65 @@ def main() -> None:
 def pile(
     scenario: ScenarioArgument = None,
     out: OutOption = Path("out/pile"),
+    from_scan: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CLOUD", help="Fill a measured surface: PLY, LAS, LAZ, XYZ or CSV (pile.scan.file)."
+        ),
+    ] = None,
+    align: Annotated[
+        Path | None, typer.Option(help="YAML file with the scan's keys: unit, rotation_deg, translation, ...")
+    ] = None,
     seed: SeedOption = None,
     set_: SetOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Make (or take from the cache) the rock pile of a scenario.
+    """Make (or take from the cache) the rock pile of a scenario, or one that fills a scan.
 
     Example: drakerock pile studies/demo.yaml --out out/pile
+
+    Example: drakerock pile studies/small.yaml --from-scan muckpile.las --align align.yaml --out out/measured
     """
     from drakerock.study.jobs import make_pile_files
 
+    if align is not None and from_scan is None:
+        raise InputError("--align: says how a scan lies in the site; give --from-scan, too")
+    if from_scan is not None:
+        from drakerock.study.survey import make_scan_overrides
+
+        # What the scenario says of its pile's origin gives way; what --set says counts.
+        set_ = [*make_scan_overrides(from_scan, align), *(set_ or [])]
     with terminal.show_progress("pile") as advance:
         summary, paths = make_pile_files(_load(scenario, seed, set_), out, advance)
     if json_:
         print(json.dumps(summary))
         return
     terminal.print_pile(summary)
+    terminal.print_paths(paths)
+
+
+@app.command()
+def survey(
+    scenario: ScenarioArgument = None,
+    out: OutOption = Path("out/survey"),
+    seed: SeedOption = None,
+    set_: SetOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """Write a pile as a survey would: the simulated scanner's cloud, the height field, the rocks' surface.
+
+    Site software opens them: PLY, LAS, GeoTIFF; npz for Python. A stored pile: --set pile.source=FILE.npz
+
+    Example: drakerock survey studies/small.yaml --out out/survey
+    """
+    from drakerock.study.survey import write_survey
+
+    with terminal.show_progress("survey") as advance:
+        summary, paths = write_survey(_load(scenario, seed, set_), out, advance)
+    if json_:
+        print(json.dumps(summary))
+        return
+    terminal.print_table("Survey", summary)
     terminal.print_paths(paths)
 
 
@@ -459,6 +502,25 @@ def study_report(
     terminal.print_paths(paths)
 
 
+@study_app.command("tornado")
+def study_tornado(
+    folder: StudyFolder,
+    out: Annotated[Path | None, typer.Option(help="Folder to write into [default: DIR].")] = None,
+    json_: JsonOption = False,
+) -> None:
+    """Draw what each variable changes of each objective, of a study that varies one thing at a time.
+
+    Example: drakerock study tornado out/sensitivity
+    """
+    from drakerock.study.tornado import run_tornado
+
+    rows, paths = run_tornado(folder, out)
+    if json_:
+        print(json.dumps(rows))
+    else:
+        terminal.print_paths(paths)
+
+
 @study_app.command("confirm")
 def study_confirm(
     folder: StudyFolder,
@@ -488,6 +550,45 @@ def study_confirm(
     else:
         print(format_confirmation(confirmation))
         terminal.print_paths([folder / "confirmation.json", report])
+
+
+@app.command()
+def calibrate(
+    study: Annotated[Path, typer.Argument(help="Study YAML file with `variables` and `calibration`.")],
+    measured: Annotated[Path, typer.Option("--measured", help="CSV file of the measured curves.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the study; made if missing.")] = Path(
+        "out/calibration"
+    ),
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a study key (dotted).")
+    ] = None,
+    json_: JsonOption = False,
+) -> None:
+    """Fit a study's variables to measured curves: values with intervals. Interrupted, it goes on when called again.
+
+    Example: drakerock calibrate studies/calibration.yaml --measured measured.csv --out out/calibration
+    """
+    from drakerock.study.calibration import run_calibration
+    from drakerock.study.display import Display
+    from drakerock.study.schema import load_study
+
+    def say(text: str) -> None:
+        terminal.print_line(text, terminal.get_console())
+
+    config = load_study(study, set_ or ())
+    with Display(terminal.get_console()) as display:
+        result, paths = run_calibration(
+            config, measured, out, workers=workers, scheduler=scheduler, display=display, say=say
+        )
+    if json_:
+        print(json.dumps(result))
+        return
+    terminal.print_calibration(result)
+    for warning in result["warnings"]:
+        say(f"warning: {warning}")
+    terminal.print_paths(paths)
 
 
 @app.command()

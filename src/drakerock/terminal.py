@@ -92,7 +92,7 @@ def print_pile(summary: dict[str, Any]) -> None:
             f"{item['size_m']:g} m", f"{item['rocks']}", f"{item['mass_kg'] / 1e3:.1f} t",
             f"{100 * item['share']:.1f} +- {100 * item['standard_error']:.1f} %", f"{100 * item['wanted']:.0f} %",
         )  # fmt: skip
-    _print_table("Pile", summary)
+    print_table("Pile", summary)
     get_output().print(gradation)
 
 
@@ -193,6 +193,21 @@ def print_sequence(summary: dict[str, Any]) -> None:
     get_output().print(f"events: {events}", soft_wrap=True)
 
 
+def print_calibration(result: dict[str, Any]) -> None:
+    """Print what `run_calibration` found: values with intervals."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=f"Calibration, {result['simulations']} simulations", title_justify="left")
+    for name in ("parameter", "best", f"{100 * result['confidence']:g} % interval", "range"):
+        table.add_column(name, justify="right")
+    for name, item in result["parameters"].items():
+        interval, ends = f"{item['low']:.4g} to {item['high']:.4g}", item["range"]
+        label = name if item["unit"] == "-" else f"{name} [{item['unit']}]"
+        table.add_row(Text(label), f"{item['best']:.4g}", interval, f"{ends[0]:g} to {ends[1]:g}")
+    get_output().print(table)
+
+
 def print_comparison(rows: list[dict[str, str]], a: str, b: str) -> None:
     """Print two loadings side by side.
 
@@ -214,7 +229,8 @@ def _kilo(value: float | None) -> float | None:
     return None if value is None else value / 1e3
 
 
-def _print_table(title: str, rows: dict[str, Any]) -> None:
+def print_table(title: str, rows: dict[str, Any]) -> None:
+    """Print names and values."""
     from rich.table import Table
 
     table = Table(title=title, show_header=False, title_justify="left")

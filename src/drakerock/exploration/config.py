@@ -28,6 +28,17 @@ class SurrogateConfig(Config):
 class SamplingConfig(Config):
     """The campaign's design of experiments."""
 
+    design: Literal["latin_hypercube", "one_at_a_time"] = Field(
+        default="latin_hypercube",
+        description="the initial design; one_at_a_time: the centre, and each variable at both ends",
+    )
+    centre: dict[str, float] = Field(
+        default={}, description="one_at_a_time: the variables' values at the centre; left out: mid-range"
+    )
+    block: str | None = Field(
+        default=None,
+        description="one_at_a_time: a variable of whole numbers, at each of which all is done again",
+    )
     n_initial: int = Field(default=24, ge=0, description="Latin hypercube points of the initial design")
     n_corners: int = Field(
         default=16, ge=0, description="corner points of the initial design, at most; all 2^d when they fit"

@@ -27,6 +27,7 @@ from scipy.stats import qmc
 from drakerock.errors import InputError
 from drakerock.exploration.config import ParetoConfig, SamplingConfig
 from drakerock.exploration.hypervolume import make_directions, measure_lengths
+from drakerock.exploration.one_at_a_time import make_one_at_a_time
 from drakerock.exploration.pareto import calc_non_dominated, pareto_front
 from drakerock.exploration.problem import Array, Problem
 from drakerock.exploration.surrogate import Kriging, Surrogate, calc_correlation, calc_ranges
@@ -37,8 +38,11 @@ def make_initial_design(problem: Problem, config: SamplingConfig, seed: int) -> 
     """Return the initial design (n, d): Latin hypercube with optimised spacing, then corner points.
 
     The hypercube minimises the phi_p criterion (p = 50, close to the largest minimal distance) by simulated
-    annealing. With more corners than `n_corners`, a spread-out subset of them is taken.
+    annealing. With more corners than `n_corners`, a spread-out subset of them is taken. With the design
+    ``one_at_a_time`` it is `make_one_at_a_time`'s.
     """
+    if config.design == "one_at_a_time":
+        return make_one_at_a_time(problem, config)
     d = len(problem.variables)
     parts = []
     if config.n_initial >= 2:

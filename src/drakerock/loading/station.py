@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import (
     Context,
@@ -109,6 +110,17 @@ class Station:
         if isinstance(plan, DigPlan):
             self._place(root_context, x_tip=float(plan.waypoint_x[0]) - loading.planning.run_up, y=plan.y)
         return field
+
+    def find_scanning_pose(self) -> RigidTransform:
+        """Return the pose X_WF of the front unit, which carries the scanner, while the machine looks at the pile.
+
+        Raises:
+            InputError: the machine cannot reach it.
+        """
+        root_context = self.diagram.CreateDefaultContext()
+        self._place(root_context, x_tip=-self.scenario.loading.sensing.scanner.distance, y=0.0)
+        front = self.plant.GetBodyByName("front_unit", self.machine.instance)
+        return self.plant.EvalBodyPoseInWorld(self.plant.GetMyContextFromRoot(root_context), front)
 
     def _place(self, root_context: Context, x_tip: float, y: float) -> None:
         set_machine_pose(

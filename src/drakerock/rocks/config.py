@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from drakerock.config import Config
@@ -107,10 +108,62 @@ class SiteConfig(Config):
         return self
 
 
+class ScanConfig(Config):
+    """A measured pile: the cloud's file, how it lies in the site, how it is cleaned."""
+
+    file_fields = ("file",)
+
+    file: Annotated[str, Field(description="point cloud: .ply, .las, .laz, .xyz, .txt, .asc, .pts or .csv")]
+    unit: Annotated[Literal["m", "cm", "mm", "ft"], Field(description="of the file's numbers")] = "m"
+    rotation_deg: Annotated[
+        tuple[float, float, float],
+        Field(description="roll, pitch, yaw about the site's x, y, z; applied first"),
+    ] = (0.0, 0.0, 0.0)
+    translation: Annotated[
+        tuple[float, float, float], Field(description="then added; the brow is x = 0, the floor z = 0 [m]")
+    ] = (0.0, 0.0, 0.0)
+    matrix: Annotated[
+        tuple[tuple[float, float, float, float], ...] | None,
+        Field(description="instead of both: 4 rows of 4, from the cloud in metres to the site; no scale"),
+    ] = None
+    cell: Annotated[float, Field(ge=0.05, le=2, description="grid spacing of the surface [m]")] = 0.26
+    max_hole: Annotated[
+        float, Field(ge=0, le=20, description="holes up to this width are filled linearly [m]")
+    ] = 1.5
+    edge_slope_deg: Annotated[
+        float, Field(ge=0, le=60, description="slope of the pile along the drift beyond the cloud's edges")
+    ] = 35.0
+    outlier_deviations: Annotated[
+        float,
+        Field(gt=0, description="an outlier's distance to its neighbours, in deviations above the median's"),
+    ] = 4.0
+    trust: Annotated[bool, Field(description="true: no checks of unit and of which side is up")] = False
+
+    @model_validator(mode="after")
+    def _check_matrix(self) -> ScanConfig:
+        if self.matrix is None:
+            return self
+        matrix = np.array(self.matrix)
+        turn = matrix[:3, :3] if matrix.shape == (4, 4) else np.zeros((3, 3))
+        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0.0:
+            raise ValueError(
+                "matrix must have 4 rows of 4 numbers, its upper left 3 x 3 a rotation without scale"
+            )
+        if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+            raise ValueError("matrix: the last row must be 0 0 0 1")
+        if any(self.rotation_deg) or any(self.translation):
+            raise ValueError("matrix stands instead of rotation_deg and translation; give one or the other")
+        return self
+
+
 class PileConfig(Config):
     """How the pile is made: rocks emitted from above and simulated to rest (method section 3)."""
 
     file_fields = ("source",)
+
+    scan: Annotated[
+        ScanConfig | None, Field(description="a measured surface to fill with rocks instead of emitting them")
+    ] = None
 
     source: Annotated[str | None, Field(description="a stored pile (.npz) to take instead of making one")] = (
         None
@@ -143,6 +196,17 @@ class PileConfig(Config):
         float,
         Field(ge=0, le=0.1, description="rocks nearer than this touch: debris is what touches no pile [m]"),
     ] = 0.005
+
+    @model_validator(mode="after")
+    def _check_origin(self) -> PileConfig:
+        if self.scan is not None and (self.source is not None or self.rocks is not None):
+            raise ValueError("scan stands instead of source and rocks: leave them out")
+        return self
+
+    @property
+    def fills_void(self) -> bool:
+        """Whether rocks are emitted until the void is full, not in a given number or to a measured surface."""
+        return self.rocks is None and self.scan is None
 
     @property
     def emission_top(self) -> float:

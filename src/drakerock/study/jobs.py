@@ -29,6 +29,7 @@ from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.site import make_site
 from drakerock.rocks.state import PileState, save_pile
 from drakerock.rocks.summary import calc_summary
+from drakerock.rocks.surveying.survey import survey_scan
 from drakerock.study.replays import update_replay
 from drakerock.viewing.replay import write_replay
 
@@ -186,7 +187,7 @@ def _summarise(values: list[float | None]) -> dict[str, Any]:
 def make_pile_files(
     scenario: Scenario, folder: Path, progress: Callable[..., None]
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Make or fetch the scenario's pile and write pile.npz, pile.json, pile.png and pile.html.
+    """Make or fetch the scenario's pile and write pile.npz, .json, .png and .html; of a scan, scan.png, too.
 
     Returns:
         The summary, and the paths written. ``at_rest`` is measured: all rocks are woken for half a second.
@@ -211,10 +212,20 @@ def make_pile_files(
         "creep_mm_p99": round(1e3 * p99, 3),
         "taken_from": str(source),
     }
+    if "scan" in pile.provenance:
+        summary |= {
+            f"scan_{name}": value for name, value in pile.provenance["scan"].items() if name != "notes"
+        }
     progress("writing", None)
     paths = [folder / name for name in ("pile.npz", "pile.json", "pile.png", "pile.html")]
     save_pile(pile, paths[0])
     write_text(paths[1], json.dumps(summary | {"provenance": pile.provenance}, indent=2) + "\n")
     write_pile_picture(pile, shapes, scenario.site, paths[2])
     write_pile_page(pile, shapes, scenario.site, paths[3])
+    if scenario.pile.scan is not None:
+        survey = survey_scan(scenario.pile.scan, scenario.site, scenario.pile, scenario.rocks)
+        from drakerock.viewing.scan_figures import write_scan_picture
+
+        write_scan_picture(survey, pile, shapes, folder / "scan.png", Path(scenario.pile.scan.file).name)
+        paths.append(folder / "scan.png")
     return summary, paths

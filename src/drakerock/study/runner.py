@@ -12,7 +12,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import floor
 from pathlib import Path
@@ -36,6 +36,9 @@ from drakerock.study.work import Task, TaskResult, count_begun
 RUN_SEQUENCE = "drakerock.loading.sequence:run_sequence"
 _POLL = 0.5
 
+Ask = Callable[[Store], Array]
+"""Says which points (n, d) a study needs next, from what is stored; none: no more."""
+
 
 def run_study(
     study: StudyConfig,
@@ -45,6 +48,7 @@ def run_study(
     scheduler: str | None = None,
     display: Display | None = None,
     work: str = RUN_SEQUENCE,
+    ask: Ask | None = None,
 ) -> dict[str, Any]:
     """Run a study to its end, or go on with one that was interrupted; write the response tables.
 
@@ -57,6 +61,7 @@ def run_study(
         workers, scheduler: instead of the study's executor settings.
         display: shows what goes on; None: nothing.
         work: the function that runs a sequence, as ``module:name``.
+        ask: says where to sample next, instead of the study's sampler; called when all points so far have ended.
 
     Returns:
         The status at the end (`read_status`).
@@ -67,7 +72,7 @@ def run_study(
         KeyboardInterrupt: Ctrl-C, once the running cycles are finished or given up.
     """
     with Store.create(folder, study) as store:
-        runner = _Runner(store, display, work)
+        runner = _Runner(store, display, work, ask)
         try:
             runner.run(workers, scheduler)
         finally:
@@ -81,9 +86,10 @@ def run_study(
 class _Runner:
     """One run of a study."""
 
-    def __init__(self, store: Store, display: Display | None, work: str) -> None:
+    def __init__(self, store: Store, display: Display | None, work: str, ask: Ask | None = None) -> None:
         self._store, self._study = store, store.study
         self._display, self._work = display, work
+        self._ask_own = ask
         self._running: dict[str, _Sequence] = {}
         self._lost: deque[_Sequence] = deque()
         self._stop_file = store.folder / f".stop-{time.time_ns()}"
@@ -176,10 +182,15 @@ class _Runner:
             validation = store.list_points("validation")
         samples = store.list_points("sample")
         while len(samples) < config.n_samples:
-            awaited = samples[: config.count_awaited(len(samples))]
+            # One's own way of asking is told of all points, once all have ended.
+            n_awaited = len(samples) if self._ask_own else config.count_awaited(len(samples))
+            awaited = samples[:n_awaited]
             if not all(point.status in ("done", "failed") for point in awaited):
                 break
-            store.add_points("sample", _next_batch(samples), self._ask(samples, {p.name for p in awaited}))
+            more = self._ask_own(store) if self._ask_own else self._ask(samples, {p.name for p in awaited})
+            if not len(more):
+                break
+            store.add_points("sample", _next_batch(samples), more)
             samples = store.list_points("sample")
         # A study resumed with fewer points leaves the rest be.
         wanted = samples[: config.n_samples] + validation[: config.n_validation]

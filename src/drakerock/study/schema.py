@@ -13,6 +13,7 @@ from pydantic_core import PydanticCustomError
 from drakerock.config import Config, list_types, load_config
 from drakerock.errors import InputError
 from drakerock.exploration.config import ExplorationConfig
+from drakerock.exploration.one_at_a_time import make_one_at_a_time
 from drakerock.exploration.problem import Array, Problem, Variable
 from drakerock.loading.scenario import Scenario
 from drakerock.randomness import derive_seed
@@ -43,26 +44,81 @@ def _find_number(key: str) -> type:
     return float if float in kinds else int
 
 
+class Choice(Config):
+    """One setting of a variable that is no number: scenario keys and their values."""
+
+    label: str
+    set: dict[str, Any] = Field(
+        default={}, description="values by dotted scenario key; {}: the scenario as it is"
+    )
+
+
 class StudyVariable(Variable):
-    """A design variable: a range, and the scenario key that it sets."""
+    """A design variable: a range and the scenario key that it sets, or choices between settings."""
 
     key: Annotated[
-        str,
+        str | None,
         Field(
             description="the scenario key it sets, dotted, such as loading.strategy.alpha; any number may be one"
         ),
-    ]
+    ] = None
+    choices: Annotated[
+        tuple[Choice, ...],
+        Field(
+            description="instead of key, low and high: the variable is 0, 1, ... for the first, second, ... of them"
+        ),
+    ] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _number_choices(cls, data: Any) -> Any:
+        if isinstance(data, dict) and isinstance(data.get("choices"), list | tuple) and data["choices"]:
+            last = len(data["choices"]) - 1
+            for name, value in (("low", 0), ("high", last)):
+                if data.setdefault(name, value) != value:
+                    raise ValueError(f"choices are numbered from 0 to {last}: leave {name} out")
+        return data
+
+    @model_validator(mode="after")
+    def _check_origin(self) -> Self:
+        if (self.key is None) == (not self.choices):
+            raise ValueError(
+                f"variable '{self.name}': give either key, low and high, or at least two choices"
+            )
+        return self
 
     @field_validator("key")
     @classmethod
-    def _check_key(cls, key: str) -> str:
-        _find_number(key)
+    def _check_key(cls, key: str | None) -> str | None:
+        if key is not None:
+            _find_number(key)
         return key
 
     @property
     def is_integer(self) -> bool:
         """Whether the key holds whole numbers; the simulation then gets the variable's value rounded."""
-        return _find_number(self.key) is int
+        return self.key is None or _find_number(self.key) is int
+
+    def describe(self, value: float) -> str:
+        """Return a value for a person: the choice's label, or the number with its unit."""
+        if self.choices:
+            return self.choices[round(value)].label
+        return f"{value:g}" if self.unit == "-" else f"{value:g} {self.unit}"
+
+    def apply(self, value: float, data: dict[str, Any]) -> None:
+        """Set a scenario's plain data to the variable's value."""
+        if self.key is not None:
+            changes: dict[str, Any] = {self.key: round(value) if self.is_integer else value}
+        else:
+            changes = self.choices[round(value)].set
+        for key, item in changes.items():
+            *parents, last = key.split(".")
+            target = data
+            for part in parents:
+                target = target[part]
+            if last not in target:
+                raise ValueError(f"variable '{self.name}': unknown scenario key '{key}'")
+            target[last] = item
 
 
 class FailureConfig(Config):
@@ -123,6 +179,55 @@ class ExecutorConfig(Config):
     slurm: SlurmConfig = SlurmConfig()
 
 
+class CurveConfig(Config):
+    """One measured curve: which signal it is compared with, over what, and how well it is known."""
+
+    signal: Annotated[
+        str,
+        Field(description="a column of signals.parquet; or profile: the mean height of the pile that is dug"),
+    ]
+    over: Annotated[
+        str, Field(description="the signal on the abscissa, such as time or x_T; of a profile: x")
+    ] = "time"
+    column: Annotated[
+        str | None, Field(description="the measured values' column; null: called as the signal")
+    ] = None
+    over_column: Annotated[
+        str | None, Field(description="the measured abscissae's column; null: as over")
+    ] = None
+    noise: Annotated[
+        float | None,
+        Field(
+            gt=0, description="standard deviation of a value, in the signal's SI unit; null: from its scatter"
+        ),
+    ] = None
+    model_error: Annotated[
+        float,
+        Field(ge=0, description="by how much a bin's mean may differ besides: what the model leaves out"),
+    ] = 0.0
+    shift: Annotated[float, Field(description="added to the measured abscissae, in SI: another zero")] = 0.0
+
+    @property
+    def measured(self) -> str:
+        """The measured values' column."""
+        return self.column or self.signal
+
+    @property
+    def measured_over(self) -> str:
+        """The measured abscissae's column."""
+        return self.over_column or self.over
+
+
+class CalibrationConfig(Config):
+    """What `drakerock calibrate` fits the study's variables to. Has no influence on what one point yields."""
+
+    curves: Annotated[tuple[CurveConfig, ...], Field(min_length=1)]
+    bins: Annotated[
+        int, Field(ge=3, le=500, description="a curve is compared by the means of so many parts")
+    ] = 24
+    confidence: Annotated[float, Field(gt=0.5, lt=1, description="probability of the intervals")] = 0.95
+
+
 class StorageConfig(Config):
     """What stays of a finished sequence."""
 
@@ -166,13 +271,16 @@ class StudyConfig(Config):
         bool, Field(description="each point has a seed and thus an original pile of its own")
     ] = False
     exploration: ExplorationConfig = ExplorationConfig()
+    calibration: Annotated[
+        CalibrationConfig | None, Field(description="measured curves that the variables are fitted to")
+    ] = None
     failures: FailureConfig = FailureConfig()
     executor: ExecutorConfig = ExecutorConfig()
     storage: StorageConfig = StorageConfig()
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        keys = [variable.key for variable in self.variables]
+        keys = [variable.key for variable in self.variables if variable.key is not None]
         self._check_parameters(keys)
         twice = sorted({key for key in keys if keys.count(key) > 1})
         if twice:
@@ -185,6 +293,7 @@ class StudyConfig(Config):
             raise ValueError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
         except InputError as error:
             raise ValueError(str(error)) from None
+        self._check_design(problem)
         # The ends of every range must be scenarios; what lies between is then taken to be one.
         for variable in problem.variables:
             for end in (variable.low, variable.high):
@@ -197,6 +306,21 @@ class StudyConfig(Config):
                         f"variables: {variable.name} = {end:g} is not a possible scenario: {message}"
                     ) from None
         return self
+
+    def _check_design(self, problem: Problem) -> None:
+        sampling = self.exploration.sampling
+        if sampling.design != "one_at_a_time":
+            return
+        try:
+            number = len(make_one_at_a_time(problem, sampling))
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        # Fewer: only the first of them are run.
+        if sampling.n_samples > number or sampling.n_validation:
+            raise ValueError(
+                f"exploration.sampling: this design, one at a time, has {number} points: n_samples: {number}, "
+                "n_validation: 0"
+            )
 
     @property
     def problem(self) -> Problem:
@@ -245,12 +369,10 @@ class StudyConfig(Config):
     def _set_variables(self, values: Mapping[str, float]) -> Scenario:
         data = self.scenario.model_dump(mode="json")
         for variable in self.variables:
-            *parents, last = variable.key.split(".")
-            target = data
-            for part in parents:
-                target = target[part]
-            value = values[variable.name]
-            target[last] = round(value) if variable.is_integer else value
+            try:
+                variable.apply(values[variable.name], data)
+            except (KeyError, TypeError) as error:
+                raise ValueError(f"variable '{variable.name}': unknown scenario key at {error}") from None
         return Scenario.model_validate(data)
 
     def make_neutral(self) -> Self:
@@ -265,6 +387,7 @@ class StudyConfig(Config):
             executor=ExecutorConfig(),
             storage=StorageConfig(),
             exploration=ExplorationConfig(sampling=sampling),
+            calibration=None,
         )
 
 

@@ -162,3 +162,56 @@ def test_a_study_varies_the_parameters_of_a_part_of_ones_own(write):
         InputError, match=r"no parameter loading.parts.controller.parameters.fource; it gives force"
     ):
         load_study(write(scenario={"loading": {"parts": parts}}, variables=[variable]))
+
+
+CHOICES = [
+    {"label": "default"},
+    {"label": "two sizes", "set": {"rocks.gradation": [
+        {"size_m": 0.2, "mass_fraction": 0.5}, {"size_m": 0.5, "mass_fraction": 0.5}]}},
+]  # fmt: skip
+
+
+def test_a_variable_may_choose_between_settings(write):
+    study = load_study(write(variables=[
+        {"name": "fines", "choices": CHOICES},
+        {"name": "friction", "key": "rocks.friction", "low": 0.5, "high": 1.0},
+    ]))  # fmt: skip
+    assert (study.problem.low[0], study.problem.high[0]) == (0.0, 1.0)
+    assert len(study.make_scenario(np.array([0.4, 0.7])).rocks.gradation) == 4
+    second = study.make_scenario(np.array([1.0, 0.7])).rocks
+    assert [item.size_m for item in second.gradation] == [0.2, 0.5]
+    assert second.friction == 0.7
+    assert study.variables[0].describe(0.9) == "two sizes"
+
+
+@pytest.mark.parametrize(
+    ("variable", "message"),
+    [
+        ({"name": "a", "choices": CHOICES, "key": "rocks.friction"}, "either key"),
+        ({"name": "a", "low": 0, "high": 1}, "either key"),
+        ({"name": "a", "choices": CHOICES, "high": 3}, "leave high out"),
+        (
+            {"name": "a", "choices": [CHOICES[0], {"label": "x", "set": {"rocks.frction": 1}}]},
+            "rocks.frction",
+        ),
+        (
+            {"name": "a", "choices": [CHOICES[0], {"label": "x", "set": {"rocks.friction": 9}}]},
+            "a = 1 is not a possible",
+        ),
+    ],
+)
+def test_choices_that_make_no_scenario_are_refused(write, variable, message):
+    with pytest.raises(InputError, match=message):
+        load_study(write(variables=[variable]))
+
+
+def test_a_design_of_one_at_a_time_says_how_many_points_it_has(write):
+    sampling = {"design": "one_at_a_time", "n_validation": 0}
+    with pytest.raises(InputError, match="has 9 points: n_samples: 9"):
+        load_study(write(exploration={"sampling": sampling}))
+    assert (
+        load_study(
+            write(exploration={"sampling": sampling | {"n_samples": 9}})
+        ).exploration.sampling.n_samples
+        == 9
+    )

@@ -14,10 +14,12 @@ from drakerock.rocks.config import MAX_ROCKS
 from drakerock.rocks.contact_graph import find_loose
 from drakerock.rocks.making.drop import Progress, drop_rocks
 from drakerock.rocks.making.emission import calc_mean_volume, make_emitter, make_rear_emitter, sample_rocks
+from drakerock.rocks.making.fill import fill_surface
 from drakerock.rocks.making.recipe import PileRecipe
 from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.site import make_confined_site
 from drakerock.rocks.state import PileState, make_empty_pile
+from drakerock.rocks.surveying.survey import survey_scan
 
 _log = logging.getLogger(__name__)
 
@@ -28,14 +30,16 @@ PACKING = 0.6
 def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState:
     """Make a pile: the static rocks of the rear wall, then rocks emitted from above, then all to rest.
 
-    With `pile.rocks` null, rocks are emitted until the void is full to the emitter. Same recipe, same pile, bit
-    for bit.
+    With `pile.rocks` null, rocks are emitted until the void is full to the emitter; with `pile.scan`, they fill the
+    measured surface instead. Same recipe, same pile, bit for bit.
 
     Raises:
-        InputError: more rocks than the engine takes, or a rock finds no room in the emitter.
+        InputError: more rocks than the engine takes, a rock finds no room in the emitter, or a scan is of no use.
         SimulationFailure: the dynamics failed, or the pile did not come to rest in time.
     """
-    _announce_number(recipe)
+    survey = recipe.pile.scan and survey_scan(recipe.pile.scan, recipe.site, recipe.pile, recipe.rocks)
+    if not survey:
+        _announce_number(recipe)
     shapes = load_rock_shapes(recipe.rocks)
     rng = make_generator(recipe.seed, "pile")
     site, n = recipe.site, recipe.pile.rocks
@@ -50,6 +54,15 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
         )  # fmt: skip
         # What holds the static rocks is no longer the contacts they settled with.
         pile = replace(layer, fixed=np.ones(len(layer), bool), contacts=None)
+    provenance = {
+        "recipe": calc_config_hash(recipe),
+        "seed": recipe.seed,
+        "versions": get_versions(),
+    }
+    if survey:
+        pile, comparison = fill_surface(survey, pile, shapes, recipe, rng, progress)
+        scan = {**comparison, "points": len(survey.points), "notes": survey.notes}
+        return replace(pile, provenance=provenance | {"scan": scan})
     number = n or count_filling(recipe, site.void_depth + 1.5 * site.drift_height)
     waiting = sample_rocks(number, recipe.rocks, shapes, rng)
     emitter = make_emitter(site, recipe.pile)
@@ -64,11 +77,6 @@ def make_pile(recipe: PileRecipe, progress: Progress | None = None) -> PileState
         )
     # The pile starts as a sequence leaves it after each loading: without loose rocks on the floor.
     pile = pile.select(pile.fixed | ~find_loose(pile, shapes, recipe.pile.contact_gap))
-    provenance = {
-        "recipe": calc_config_hash(recipe),
-        "seed": recipe.seed,
-        "versions": get_versions(),
-    }
     return replace(pile, provenance=provenance)
 
 

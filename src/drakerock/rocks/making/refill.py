@@ -28,9 +28,10 @@ def refill(
     """Return the pile without the removed rocks, new ones emitted from above until its level is restored, at rest.
 
     The new rocks have the removed ones' shapes and sizes, so that the gradation stays over a long sequence. With
-    `pile.rocks` set, all are emitted and their number stays too; those that find no room, because the pile reaches
-    up to the emitter, wait for the next refill (in the provenance). With null, the void is filled to the emitter
-    again: none is emitted while the void's level has not sunk, and further ones are drawn when the pile has slid.
+    `pile.rocks` or `pile.scan` set, all are emitted and their number stays too; those that find no room, because the
+    pile reaches up to the emitter, wait for the next refill (in the provenance). Else, the void is filled to the
+    emitter again: none is emitted while the void's level has not sunk, and further ones are drawn when the pile has
+    slid.
 
     Args:
         pile: all rocks, the removed ones among them.
@@ -42,7 +43,7 @@ def refill(
     Raises:
         SimulationFailure: as `drop_rocks`.
     """
-    waiting, until_full = replace(pile.select(removed), contacts=None), recipe.pile.rocks is None
+    waiting, until_full = replace(pile.select(removed), contacts=None), recipe.pile.fills_void
     if WAITING in pile.provenance:
         waiting = _make_waiting(**pile.provenance[WAITING]).join(waiting)
     if until_full:
