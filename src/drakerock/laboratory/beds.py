@@ -151,7 +151,7 @@ def calc_profile(
 
 
 def fit_slope(x: Array, h: Array) -> tuple[float, float]:
-    """Return slope and height at x = 0 of the line through a flank that rises with x, between 20 and 80 % of its height.
+    """Return slope and height at x = 0 of a line through a flank that rises with x, from 20 to 80 % of its height.
 
     nan if there is no such flank.
     """

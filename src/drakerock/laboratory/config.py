@@ -20,21 +20,26 @@ Lengths = tuple[Annotated[float, Field(gt=0, le=50)], ...]
 class LabSettings(Config):
     """Of every test."""
 
-    rocks: Annotated[int, Field(ge=20, le=20_000, description="in each specimen")] = 300
-    repeats: Annotated[int, Field(ge=1, le=100, description="specimens, each of rocks of its own")] = 4
+    rocks: Annotated[int, Field(ge=20, le=20_000, description="in each specimen")] = 250
+    repeats: Annotated[int, Field(ge=1, le=100, description="specimens, each of rocks of its own")] = 3
 
 
 class ReposeSettings(LabSettings):
     """Angle of repose: behind a withdrawn wall, and in a tilted box."""
 
     gate_speed: Annotated[float, Field(gt=0, le=5, description="of the withdrawn wall [m/s]")] = 1.0
-    tilt_rate_deg: Annotated[float, Field(gt=0, le=20, description="of the box [deg/s]")] = 4.0
+    tilt_rate_deg: Annotated[float, Field(gt=0, le=20, description="of the box [deg/s]")] = 6.0
 
 
 class ShearSettings(LabSettings):
-    """Drained triaxial compression between smooth platens, without gravity."""
+    """Triaxial compression between smooth platens, without gravity."""
 
-    repeats: Annotated[int, Field(ge=1, le=100, description="specimens, each of rocks of its own")] = 3
+    filling_friction: Annotated[
+        float,
+        Field(
+            gt=0, le=1, description="while rocks are squeezed together, over their own: the less, the denser"
+        ),
+    ] = 0.3
     stresses_kPa: Stresses = (50.0, 100.0, 200.0)
     strain_rate: Annotated[float, Field(gt=0, le=0.5, description="axial [1/s]")] = 0.05
     strain: Annotated[float, Field(ge=0.05, le=0.5, description="axial, at the end")] = 0.15
@@ -44,7 +49,6 @@ class DischargeSettings(LabSettings):
     """Rocks run out of a slot, and out of a hopper with a slot."""
 
     rocks: Annotated[int, Field(ge=20, le=20_000, description="in each specimen")] = 500
-    repeats: Annotated[int, Field(ge=1, le=100, description="specimens, each of rocks of its own")] = 3
     openings: Annotated[Lengths, Field(min_length=3, description="of the slot [mean size]")] = (3.5, 4.5, 5.5)
     hopper_angle_deg: Annotated[
         float, Field(ge=10, le=45, description="of the hopper's walls, to the vertical")
@@ -63,7 +67,6 @@ class SiloSettings(LabSettings):
 class SettlementSettings(LabSettings):
     """Rocks dropped in layers, then loaded by a lid."""
 
-    repeats: Annotated[int, Field(ge=1, le=100, description="specimens, each of rocks of its own")] = 3
     drops: Annotated[
         tuple[Annotated[float, Field(ge=0.1, le=20)], ...],
         Field(min_length=1, description="heights over the bed [m]"),
@@ -74,7 +77,6 @@ class SettlementSettings(LabSettings):
 class PenetrationSettings(LabSettings):
     """A tool pushed level into a slope at imposed speeds."""
 
-    repeats: Annotated[int, Field(ge=1, le=100, description="specimens, each of rocks of its own")] = 3
     speeds: Annotated[
         tuple[Annotated[float, Field(gt=0, le=3)], ...], Field(min_length=1, description="[m/s]")
     ] = (0.3, 0.6, 1.2)
@@ -87,8 +89,7 @@ class PenetrationSettings(LabSettings):
 class DragSettings(LabSettings):
     """A vertical blade as wide as the bed, drawn through it."""
 
-    rocks: Annotated[int, Field(ge=20, le=20_000, description="in each specimen")] = 400
-    repeats: Annotated[int, Field(ge=1, le=100, description="specimens, each of rocks of its own")] = 3
+    rocks: Annotated[int, Field(ge=20, le=20_000, description="in each specimen")] = 350
     depths: Annotated[Lengths, Field(min_length=1, description="of the blade's edge [mean size]")] = (
         1.5,
         2.5,

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from drakerock.errors import InputError
 from drakerock.laboratory.beds import (
+    LEAST_WIDTH,
     PACKING,
     Bin,
     MakeRig,
     calc_packing,
     calc_profile,
     fill_bin,
-    make_bin,
     settle,
 )
 from drakerock.laboratory.config import DragSettings, LabSettings, ShearSettings
@@ -124,9 +124,7 @@ class DragTest:
         x = np.concatenate([record.travels["blade"] for record in records])
         force = -np.concatenate([record.forces["blade"][:, 0] for record in records])
         edges = travel * (STARTED + (1 - STARTED) * np.linspace(0, 1, SLICES + 1))
-        measured = np.array(
-            [force[(x > a) & (x <= b)].mean() for a, b in itertools.pairwise(edges)]
-        )
+        measured = np.array([force[(x > a) & (x <= b)].mean() for a, b in itertools.pairwise(edges)])
         places = travel * (np.arange(2 * SLICES) + 1) / (2 * SLICES)
         heaped = np.interp(0.5 * (edges[1:] + edges[:-1]), places, heaps)
         weight = density * GRAVITY
@@ -170,7 +168,6 @@ class DragTest:
 def _make_bed(material: Material, rocks: int, length: float, height: float) -> Bin:
     """Return a bed of a length and a height, as wide as its rocks make it; InputError if that is too narrow."""
     width = rocks * material.mean_volume / (PACKING * length * height)
-    made = make_bin(material, rocks, length / height, width / height)
-    if made.width < 1.5 * material.largest:
+    if width < LEAST_WIDTH * material.largest:
         raise InputError("rocks: too few for this depth and travel; raise rocks, or lower travel or depths")
     return Bin(length, width, height)

@@ -53,6 +53,8 @@ class PenetrationTest:
         x = np.arange(-4.0 * room.height, room.length, 0.25 * d)
         slope, offset = fit_slope(x, calc_profile(pile, material, x, 0.4 * room.width))
         surface = (height - offset) / slope
+        # Single rocks that rolled out before the slope's foot are no part of it.
+        pile = pile.select(pile.p_WRs[:, 0] > -offset / slope - 0.5 * d)
         deepest = (max(settings.depths) + WINDOW) * d
         values: dict[str, float] = {}
         curves = {}

@@ -49,12 +49,16 @@ class ShearTest:
         pile = scatter(material, settings.rocks, (0.0, 0.0, 0.0), (side, side), seed)
         spans = np.full(3, side)
         spans[2] = float((pile.p_WRs[:, 2] + material.largest).max())
+        slippery = replace(
+            material,
+            config=material.config.replace(friction=settings.filling_friction * material.config.friction),
+        )
         values: dict[str, float] = {}
         curves: dict[str, tuple[Array, Array]] = {}
         axial = []
         stresses = 1e3 * np.array(sorted(settings.stresses_kPa))
         for stress in stresses:
-            pile, spans = _compress(pile, spans, stress, material, make_rig)
+            pile, spans = _compress(pile, spans, stress, slippery, make_rig)
             found, curve, end = _shear(pile, spans, stress, material, settings, make_rig)
             label = f"{stress / 1e3:g}"
             values |= {f"{key}_{label}": value for key, value in found.items()}

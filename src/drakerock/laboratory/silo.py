@@ -34,7 +34,6 @@ class SiloTest:
         floor = Mover("floor", room.make_walls("f", 0.0), (0.0, 0.0, -1.0))
         rig = make_rig(Scene(walls, (floor,)), fill_bin(material, settings.rocks, room, seed), material)
         settle(rig, material)
-        rest = rig.advance(0.2)
         record = rig.advance(WAY * material.mean_size / SPEED, {"floor": SPEED})
         pile = rig.get_pile()
         weight = GRAVITY * float(material.calc_masses(pile).sum())
@@ -48,7 +47,6 @@ class SiloTest:
         law = calc_janssen_share(height, *section, settings.wall_friction, 0.52)
         return Specimen(
             {
-                "rest": float(-rest.forces["floor"][:, 2].mean() / weight),
                 "share": share,
                 "k": k,
                 "height": height / room.width,
@@ -64,8 +62,7 @@ class SiloTest:
         """Return what the floor carries beside Janssen's law."""
         names = {
             "height": ("height over width", ""),
-            "rest": ("share of the weight on the floor, as filled", ""),
-            "share": ("... let down", ""),
+            "share": ("share of the weight on the floor, let down", ""),
             "k": ("lateral over vertical stress (Janssen)", ""),
         }
         law = float(np.mean([specimen.values["law"] for specimen in specimens]))
