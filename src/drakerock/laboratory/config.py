@@ -81,9 +81,14 @@ class PenetrationSettings(LabSettings):
         tuple[Annotated[float, Field(gt=0, le=3)], ...], Field(min_length=1, description="[m/s]")
     ] = (0.3, 0.6, 1.2)
     depths: Annotated[Lengths, Field(min_length=2, description="of the tip [mean size]")] = (1.0, 2.0, 3.0)
-    height: Annotated[float, Field(ge=0.1, le=10, description="of the plate over the floor [mean size]")] = (
-        1.0
-    )
+    height: Annotated[
+        float,
+        Field(
+            ge=0.02,
+            le=10,
+            description="of the edge over the floor [mean size]; rocks that fit under it jam between both",
+        ),
+    ] = 0.1
 
 
 class DragSettings(LabSettings):
