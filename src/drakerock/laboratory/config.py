@@ -77,6 +77,8 @@ class SettlementSettings(LabSettings):
 class PenetrationSettings(LabSettings):
     """A tool pushed level into a slope at imposed speeds."""
 
+    repeats: Annotated[int, Field(ge=1, le=100, description="specimens, each of rocks of its own")] = 6
+
     speeds: Annotated[
         tuple[Annotated[float, Field(gt=0, le=3)], ...], Field(min_length=1, description="[m/s]")
     ] = (0.3, 0.6, 1.2)

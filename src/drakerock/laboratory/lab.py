@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from math import isfinite
 
 from drakerock.config import parse_config
 from drakerock.errors import InputError
@@ -103,6 +104,10 @@ def run_test(
         "versions": get_versions(),
         "cpu_s": round(time.process_time() - started, 1),
         "specimen_cpu_s": times,
+        "specimens": [
+            {key: float(f"{value:.6g}") if isfinite(value) else None for key, value in one.values.items()}
+            for one in specimens
+        ],
     }
     snapshots = tuple(one.snapshot for one in specimens if one.snapshot is not None)
     return LabResult(test.name, test.title, rows, panels, snapshots, facts)

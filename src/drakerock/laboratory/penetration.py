@@ -25,14 +25,13 @@ Array = NDArray[np.float64]
 WIDTH, WIDTH_SHARE, THICK, BUCKET_HEIGHT = 3.0, 0.7, 0.2, 2.0
 # Steel on rock.
 FRICTION = 0.4
-# Forces are means over this way of the tip to both sides of a depth; a push starts so far before the first rock
-# [mean size].
-WINDOW, CLEARANCE = 0.25, 0.1
+# A push starts so far before the first rock [mean size].
+CLEARANCE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class PenetrationTest:
-    """Force over depth, its exponent, and what speed adds.
+    """Mean force down to a depth, its exponent, and what speed adds.
 
     Attributes:
         name: plate or bucket.
@@ -55,7 +54,7 @@ class PenetrationTest:
         surface = (height - offset) / slope
         # Single rocks that rolled out before the slope's foot are no part of it.
         pile = pile.select(pile.p_WRs[:, 0] > -offset / slope - 0.5 * d)
-        deepest = (max(settings.depths) + WINDOW) * d
+        deepest = max(settings.depths) * d
         values: dict[str, float] = {}
         curves = {}
         last, tool, travel = pile, self._make_tool(0.0, height, 1.0, d), 0.0
@@ -74,8 +73,8 @@ class PenetrationTest:
             curves[label] = (depth, force)
             means = []
             for wanted in settings.depths:
-                near = np.abs(depth - wanted) < WINDOW
-                means.append(float(force[near].mean()))
+                inside = (depth > 0) & (depth < wanted)
+                means.append(float(force[inside].mean()))
                 values[f"force_{label}_{wanted:g}"] = means[-1]
             values[f"peak_{label}"] = float(force.max())
             positive = np.array(means) > 0
@@ -119,7 +118,7 @@ class PenetrationTest:
         for speed in settings.speeds:
             label = f"{speed:g}"
             for depth in settings.depths:
-                name = f"force at {label} m/s, {depth:g} mean sizes deep"
+                name = f"mean force at {label} m/s, to {depth:g} mean sizes deep"
                 rows.append(make_row(specimens, f"force_{label}_{depth:g}", name, "kN"))
             rows.append(make_row(specimens, f"peak_{label}", f"greatest force at {label} m/s", "kN"))
             rows.append(

@@ -120,7 +120,7 @@ def calc_blade_force(
     def calc_force(beta: float) -> float:
         resistance = np.cos(rake + wall) + np.sin(rake + wall) / np.tan(beta + friction)
         if resistance <= 1e-9:
-            return float("inf")
+            return 1e30  # it would jam
         wedge = 0.5 * weight * depth**2 * width * (1.0 / np.tan(rake) + 1.0 / np.tan(beta))
         return float((wedge + surcharge) / resistance)
 
