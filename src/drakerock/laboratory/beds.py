@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from drakerock.errors import InputError
 from drakerock.laboratory.material import Material
@@ -26,8 +27,6 @@ LEAST_WIDTH = 2.0
 THICKNESS = 4.0
 # Rocks rest when they move slower on average, by mass [m/s]; looked at this often, for so long at most [s].
 REST_SPEED, LOOK, LONGEST = 0.02, 0.25, 6.0
-# A slope is taken between these shares of its height: neither foot nor crest.
-SLOPE_RANGE = (0.2, 0.8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,18 +150,28 @@ def calc_profile(
 
 
 def fit_slope(x: Array, h: Array) -> tuple[float, float]:
-    """Return slope and height at x = 0 of a line through a flank that rises with x, from 20 to 80 % of its height.
+    """Return slope and height at x = 0 of the flank of a surface: floor, straight flank, level crest, fitted together.
 
     nan if there is no such flank.
+
+    Args:
+        x: (k,) rising [m].
+        h: (k,) the surface [m].
     """
-    low, high = SLOPE_RANGE[0] * h.max(initial=0.0), SLOPE_RANGE[1] * h.max(initial=0.0)
-    stop = int(np.argmax(h >= high)) if len(h) else 0
-    below = np.flatnonzero(h[:stop] <= low)
-    start = int(below[-1]) + 1 if len(below) else 0
-    if stop - start < 3:
+    crest = float(np.quantile(h[h > 0.0], 0.9)) if (h > 0.0).any() else 0.0
+    if crest <= 0.0 or h[0] > 0.5 * crest:
         return float("nan"), float("nan")
-    slope, offset = np.polyfit(x[start:stop], h[start:stop], 1)
-    return float(slope), float(offset)
+    foot, top = x[np.argmax(h > 0.1 * crest)], x[np.argmax(h > 0.9 * crest)]
+
+    def calc_misses(ramp: Array) -> Array:
+        return np.asarray(np.interp(x, ramp[:2], [0.0, ramp[2]]) - h)
+
+    least = x[1] - x[0]
+    ramp = least_squares(calc_misses, [foot, max(top, foot + least), crest]).x
+    if not ramp[1] > ramp[0]:
+        return float("nan"), float("nan")
+    slope = ramp[2] / (ramp[1] - ramp[0])
+    return float(slope), float(-slope * ramp[0])
 
 
 def calc_packing(pile: PileState, material: Material, low: Array, high: Array) -> float:

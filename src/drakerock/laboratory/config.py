@@ -27,6 +27,7 @@ class LabSettings(Config):
 class ReposeSettings(LabSettings):
     """Angle of repose: behind a withdrawn wall, and in a tilted box."""
 
+    repeats: Annotated[int, Field(ge=1, le=100, description="specimens, each of rocks of its own")] = 4
     gate_speed: Annotated[float, Field(gt=0, le=5, description="of the withdrawn wall [m/s]")] = 1.0
     tilt_rate_deg: Annotated[float, Field(gt=0, le=20, description="of the box [deg/s]")] = 6.0
 
@@ -77,7 +78,7 @@ class SettlementSettings(LabSettings):
 class PenetrationSettings(LabSettings):
     """A tool pushed level into a slope at imposed speeds."""
 
-    repeats: Annotated[int, Field(ge=1, le=100, description="specimens, each of rocks of its own")] = 6
+    repeats: Annotated[int, Field(ge=1, le=100, description="specimens, each of rocks of its own")] = 4
 
     speeds: Annotated[
         tuple[Annotated[float, Field(gt=0, le=3)], ...], Field(min_length=1, description="[m/s]")

@@ -49,7 +49,7 @@ def test_a_lid_that_is_pressed_carries_its_force(material):
         (0.0, 0.0, 1.0),
         drive="force",
         mass=500.0,
-        damping=2e4,
+        damping=1e4,
     )
     rig = DrakeRig(Scene((Slab((20.0, 20.0, 2.0), (0.0, 0.0, -1.0)),), (lid,)), pile, material)
     rig.advance(0.8)
