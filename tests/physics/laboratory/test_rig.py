@@ -29,7 +29,9 @@ def test_a_tray_weighs_its_rocks_and_moves_as_told(material):
     assert rig.get_pile().p_WRs[:, 2].min() > 0.25
 
 
-def test_a_rock_on_a_sliding_plate_is_dragged_by_the_pairs_friction(material):
+def test_a_rock_on_a_sliding_plate_is_dragged_by_the_pairs_friction():
+    # Not with the plant's single points: a rock that slides trips over its edge there (docs/validation.md).
+    material = make_material(RocksConfig(), DynamicsConfig())
     pile = scatter_rocks(1, (-0.5, -0.5, 0.0), (0.5, 0.5, 1.0), material.config, seed=1)
     weight = GRAVITY * material.calc_masses(pile).sum()
     stop = Slab((0.5, 4.0, 4.0), (0.9, 0.0, 2.02), friction=0.0)
