@@ -14,12 +14,12 @@ from drakerock.rocks.config import GRAVITY
 Array = NDArray[np.float64]
 
 REPOSE = (34.0, 40.0, "dumped mine rock, observed 34 to 40 deg (Colowyo mine, Colorado DRMS file 71445)")
-PACKING = (0.59, 0.77, "porosity of dumped rockfill 23 to 41 % (void ratio 0.3 to 0.7)")
+PACKING = (0.59, 0.77, "swell of blasted rock by 30 to 70 % (handbooks)")
 JANSSEN_K = (0.45, 0.60, "aggregate, 0.52 within a factor of 1.15 (EN 1991-4, annex E)")
 BEVERLOO_C, BEVERLOO_K = 1.03, 1.4
 """Of Beverloo's law for a slot, with the velocity's coefficient for slots and the usual empty edge (Nedderman 1992)."""
-INSERTION_EXPONENT = (1.0, 1.5, "force ~ depth^1.25, bucket inserted into a heap (loader design practice)")
-FEE_RESIDUAL = (0.0, 15.0, "fundamental earth-moving equation against tests, 10 to 15 % RMSE")
+INSERTION_EXPONENT = (1.0, 2.0, "friction under a level bed 1, under a slope that rises from the tip 2")
+FEE_RESIDUAL = (0.0, 15.0, "10 to 15 % with parameters fitted to the cycle before (arXiv 2506.22579)")
 
 
 def calc_rockfill_friction(stress: float) -> tuple[float, float]:
