@@ -1,7 +1,8 @@
 """A plate of 30 t pushed into a small pile with 150 kN, in both engines, each refined: python benchmarks/plate_push.py
 
-What is displaced differed between engines; here the same small piles are pushed by variants of each, so that the finer
-solution tells which is right. Needed: pip install rapier3d. Runs are added to a file of lines, and skipped if stored.
+`force`: what is displaced by a plate on the floor that is pushed with a force. `jam`: the force on a plate that is pushed at a
+given speed so high over the floor that rocks fit under it. The same small piles are pushed by variants of both engines, so
+that the finer solution tells which is right. Needed: pip install rapier3d. Runs are added to a file of lines, and skipped if stored.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,17 +18,20 @@ import rapier3d as rapier
 from laboratory_peers import RapierRig
 from scipy.stats import t as student
 
-from drakerock.laboratory.beds import calc_profile, fit_slope, make_bin
+from drakerock.laboratory.beds import Bin, calc_profile, fit_slope, make_bin
 from drakerock.laboratory.material import Material, make_material
 from drakerock.laboratory.repose import make_slope
 from drakerock.laboratory.rig import DrakeRig
 from drakerock.laboratory.scene import Mover, Scene, Slab
 from drakerock.loading.scenario import load_scenario
 from drakerock.randomness import derive_seed
+from drakerock.rocks.geometry import make_pile_mesh
 from drakerock.rocks.state import PileState, load_pile, save_pile
 
 # A third of the plate, its force and its mass: the pile is small [kg, N], times [s].
 MASS, FORCE, RELAXING, PUSHING, RESTING = 30e3, 150e3, 1.0, 2.5, 0.5
+# Of the jam: speed [m/s], way [m], and how often rocks are looked at [s].
+JAM_SPEED, JAM_WAY, JAM_LOOK = 0.6, 1.2, 0.05
 THRESHOLDS = (0.01, 0.02, 0.05, 0.1, 0.2)
 ROCKS = 500
 # Of the plate, its edge forward, on the floor [m].
@@ -89,7 +94,20 @@ def get_pile(seed: int, material: Material, folder: Path) -> PileState:
     return load_pile(path)
 
 
-def run(name: str, seed: int, folder: Path) -> dict[str, float]:
+@dataclass(frozen=True)
+class Start:
+    """A pile without the single rocks before it, where it begins, and its bench."""
+
+    pile: PileState
+    toe: float
+    room: Bin
+    material: Material
+
+    def make_scene(self, mover: Mover) -> Scene:
+        return Scene(self.room.make_walls("flre", 0.0, 4.0 * self.room.height), (mover,))
+
+
+def make_start(seed: int, folder: Path) -> Start:
     scenario = load_scenario(None, ())
     material = make_material(scenario.rocks, scenario.dynamics)
     d = material.mean_size
@@ -99,15 +117,22 @@ def run(name: str, seed: int, folder: Path) -> dict[str, float]:
     slope, offset = fit_slope(x, calc_profile(pile, material, x, 0.4 * room.width))
     toe = -offset / slope
     pile = pile.select(pile.p_WRs[:, 0] > toe - 0.5 * d)
+    return Start(pile, toe, room, material)
+
+
+def make_variant(name: str) -> Material:
+    scenario = load_scenario(None, OURS.get(name, ()))
+    return make_material(scenario.rocks, scenario.dynamics)
+
+
+def run_force(name: str, seed: int, folder: Path) -> dict[str, float]:
+    begin = make_start(seed, folder)
+    pile, toe, material = begin.pile, begin.toe, make_variant(name)
     start = float(np.min(pile.p_WRs[:, 0] - 0.8 * pile.size)) - 0.2
     plate = Slab((LENGTH, WIDTH, THICKNESS), (start - 0.5 * LENGTH, 0.0, GAP + 0.5 * THICKNESS), friction=0.4)
     mover = Mover("plate", (plate,), (1.0, 0.0, 0.0), drive="force", mass=MASS)
-    scene = Scene(room.make_walls("flre", 0.0, 4.0 * room.height), (mover,))
-    if name in OURS:
-        scenario = load_scenario(None, OURS[name])
-        material = make_material(scenario.rocks, scenario.dynamics)
     cpu = time.process_time()
-    rig = make_rig(name, scene, pile, material)
+    rig = make_rig(name, begin.make_scene(mover), pile, material)
     rig.advance(RELAXING)
     before = rig.get_pile().p_WRs
     record = rig.advance(PUSHING, {"plate": FORCE})
@@ -132,32 +157,61 @@ def run(name: str, seed: int, folder: Path) -> dict[str, float]:
     return result | {f"moved_{100 * far:g}cm_m3": calc_moved(before, pushed, far) for far in THRESHOLDS}
 
 
+def run_jam(name: str, seed: int, folder: Path) -> dict[str, float]:
+    """Push a plate at a mean size over the floor; tell force, and how deep rocks are pressed into the floor."""
+    begin = make_start(seed, folder)
+    material, d = make_variant(name), begin.material.mean_size
+    start = begin.toe - 0.5 * d
+    plate = Slab((LENGTH, WIDTH, THICKNESS), (start - 0.5 * LENGTH, 0.0, d + 0.5 * THICKNESS), friction=0.4)
+    cpu = time.process_time()
+    rig = make_rig(name, begin.make_scene(Mover("plate", (plate,), (1.0, 0.0, 0.0))), begin.pile, material)
+    forces, deepest = [], 0.0
+    for _ in range(round(JAM_WAY / JAM_SPEED / JAM_LOOK)):
+        record = rig.advance(JAM_LOOK, {"plate": JAM_SPEED})
+        forces.append(-record.forces["plate"][:, 0])
+        deepest = max(deepest, -float(make_pile_mesh(rig.get_pile(), material.shapes).vertices[:, 2].min()))
+    force = np.concatenate(forces) / 1e3
+    return {
+        "mean_kN": float(force.mean()),
+        "peak_kN": float(force.max()),
+        "in_floor_mm": 1e3 * deepest,
+        "cpu_s": round(time.process_time() - cpu, 1),
+    }
+
+
+COLUMNS = {
+    "force": ("reach_m", "last_metre_kN", "moved_1cm_m3", "moved_5cm_m3", "moved_20cm_m3", "cpu_s"),
+    "jam": ("mean_kN", "peak_kN", "in_floor_mm", "cpu_s"),
+}
+RUNS = {"force": run_force, "jam": run_jam}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("push", choices=list(RUNS))
     parser.add_argument("--variants", nargs="+", choices=[*OURS, *THEIRS], default=[*OURS, *THEIRS])
     parser.add_argument("--piles", type=int, default=4)
-    parser.add_argument("--out", type=Path, default=Path("build/plate_push.jsonl"))
+    parser.add_argument("--out", type=Path, default=Path("build/plate_push"))
     options = parser.parse_args()
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    lines = options.out.read_text().splitlines() if options.out.exists() else []
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / f"{options.push}.jsonl"
+    lines = path.read_text().splitlines() if path.exists() else []
     stored = {(one["variant"], one["pile"]): one for one in map(json.loads, lines)}
     for seed in range(options.piles):
         for name in options.variants:
             if (name, seed) in stored:
                 continue
-            found = {k: round(v, 4) for k, v in run(name, seed, options.out.parent).items()}
+            found = {k: round(v, 4) for k, v in RUNS[options.push](name, seed, options.out).items()}
             stored[name, seed] = {"variant": name, "pile": seed, **found}
-            with open(options.out, "a", encoding="utf-8") as file:
+            with open(path, "a", encoding="utf-8") as file:
                 file.write(json.dumps(stored[name, seed]) + "\n")
             print(name, seed, found, flush=True)
-    print("| variant | piles | reach [m] | last metre [kN] | moved by 1 cm [m3] | 5 cm | 20 cm | CPU s |")
-    print("|---|---|---|---|---|---|---|---|")
+    columns = COLUMNS[options.push]
+    print("| variant | piles | " + " | ".join(columns) + " |")
+    print("|---" * (2 + len(columns)) + "|")
     for name in options.variants:
         rows = [one for (variant, _), one in stored.items() if variant == name]
-        cells = [
-            _show(np.array([row[key] for row in rows]))
-            for key in ("reach_m", "last_metre_kN", "moved_1cm_m3", "moved_5cm_m3", "moved_20cm_m3", "cpu_s")
-        ]
+        cells = [_show(np.array([row[key] for row in rows])) for key in columns]
         print(f"| {name} | {len(rows)} | " + " | ".join(cells) + " |")
 
 
