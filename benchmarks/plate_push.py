@@ -1,9 +1,9 @@
 """A plate of 30 t pushed into a small pile, in both engines, each refined: python benchmarks/plate_push.py force
 
 `force`: what is displaced by a plate on the floor that is pushed with 150 kN. `jam`: the force on a plate that is
-pushed at a given speed so high over the floor that rocks fit under it. The same small piles are pushed by variants of both
-engines, so that the finer solution tells which is right. Needed: pip install rapier3d. Runs are added to a file of
-lines, and skipped if stored.
+pushed at a given speed so high over the floor that rocks fit under it. The same small piles are pushed by variants of
+both engines, so that the finer solution tells which is right. Needed: pip install rapier3d. Runs are added to a file
+of lines, and skipped if stored.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from drakerock.errors import InputError
 from drakerock.laboratory.beds import (
     LEAST_WIDTH,
     PACKING,
+    THICKNESS,
     Bin,
     MakeRig,
     calc_packing,
@@ -30,8 +31,8 @@ from drakerock.rocks.config import GRAVITY
 
 Array = NDArray[np.float64]
 
-# Of the blade and of the bed under its edge [mean size]; behind it there is this much of the bed [depth].
-BLADE, UNDER, BEHIND = 0.6, 1.2, 0.6
+# Of the blade and of the bed under its edge [mean size].
+BLADE, UNDER = 0.2, 1.2
 # Before the blade's last place there is so much of the bed, for the wedge [depth].
 AHEAD = 3.0
 # The force is taken after this share of the travel; forces are means over so many slices of it.
@@ -87,34 +88,35 @@ class DragTest:
     ) -> tuple[tuple[Array, Array, Array, Array, Array], object]:
         d = material.mean_size
         travel = settings.travel * depth
-        start = BEHIND * depth + BLADE * d
-        room = _make_bed(material, settings.rocks, start + travel + AHEAD * depth, depth + UNDER * d)
-        walls = room.make_walls("flrae", 0.0)
-        level, tall = room.height, 30.0
-        thick = BLADE * d
+        room = _make_bed(material, settings.rocks, travel + AHEAD * depth, depth + UNDER * d)
+        level, tall = room.height, 40.0
+        thick, edge = BLADE * d, level - depth
+        # The bed ends at the blade; under its edge a step holds it.
+        step = Slab((THICKNESS, room.width, THICKNESS), (-0.5 * THICKNESS, 0.0, edge - 0.5 * THICKNESS))
+        walls = (*room.make_walls("flre", 0.0), step)
         blade = Slab(
             (thick, room.width, tall),
-            (start - 0.5 * thick, 0.0, level - depth + 0.5 * tall),
+            (-0.5 * thick, 0.0, edge + 0.5 * tall),
             friction=settings.blade_friction,
         )
         mover = Mover("blade", (blade,), (1.0, 0.0, 0.0))
         rig = make_rig(Scene(walls, (mover,)), fill_bin(material, settings.rocks, room, seed), material)
         settle(rig, material)
         bed = rig.get_pile()
-        ahead = np.arange(start, room.length, 0.25 * d)
+        ahead = np.arange(0.0, room.length, 0.25 * d)
         before = calc_profile(bed, material, ahead, 0.45 * room.width)
         # The level that rocks really have before the blade, and so the depth.
-        surface = float(before[(ahead > start + 0.5 * d) & (ahead < start + travel + depth)].mean())
-        cut = surface - (level - depth)
+        surface = float(before[(ahead > 0.5 * d) & (ahead < travel + depth)].mean())
+        cut = surface - edge
         density = material.config.density * calc_packing(
             bed, material,
-            np.array([start, -0.5 * room.width, 0.3 * d]),
+            np.array([0.0, -0.5 * room.width, 0.3 * d]),
             np.array([room.length, 0.5 * room.width, max(surface - 0.7 * d, d)]),
         )  # fmt: skip
         records, heaps = [], []
         for _ in range(2 * SLICES):
             records.append(rig.advance(travel / settings.speed / (2 * SLICES), {"blade": settings.speed}))
-            at = start + float(records[-1].travels["blade"][-1])
+            at = float(records[-1].travels["blade"][-1])
             now = calc_profile(rig.get_pile(), material, ahead, 0.45 * room.width)
             front = ahead > at
             raised = float(
