@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,7 +35,7 @@ MASS, FORCE, RELAXING, PUSHING, RESTING = 30e3, 150e3, 1.0, 2.5, 0.5
 # Of the jam: speed [m/s], way [m], and how often rocks are looked at [s].
 JAM_SPEED, JAM_WAY, JAM_LOOK = 0.6, 1.2, 0.05
 THRESHOLDS = (0.01, 0.02, 0.05, 0.1, 0.2)
-ROCKS = 500
+ROCKS = 400
 # Of the plate, its edge forward, on the floor [m].
 WIDTH, THICKNESS, LENGTH, GAP = 1.4, 0.1, 6.0, 0.03
 NONE = "dynamics.nonsmooth.reduction=none"
@@ -62,7 +63,7 @@ THEIRS = {
     "rapier, 16 iterations": (1, 16, {}),
     "rapier, 5 ms, 16 iterations": (2, 16, {}),
     "rapier, 2.5 ms, 32 iterations": (4, 32, {}),
-    "rapier, 1 ms, 64 iterations": (10, 64, {}),
+    "rapier, 2.5 ms, 32 iterations, stiff": (4, 32, {"stiff": True}),
     "rapier, 1 ms, 64 iterations, stiff": (10, 64, {"stiff": True}),
 }
 
@@ -85,7 +86,7 @@ def make_rig(name: str, scene: Scene, pile: PileState, material: Material) -> ob
 
 
 def get_pile(seed: int, material: Material, folder: Path) -> PileState:
-    path = folder / f"plate_push_{seed}.npz"
+    path = folder / f"pile_{ROCKS}_{seed}.npz"
     if not path.exists():
         room = make_bin(material, ROCKS, 2.2, 1.3)
         _, pile, _ = make_slope(
@@ -187,13 +188,13 @@ COLUMNS = {
 RUNS = {"force": run_force, "jam": run_jam}
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("push", choices=list(RUNS))
     parser.add_argument("--variants", nargs="+", choices=[*OURS, *THEIRS], default=[*OURS, *THEIRS])
     parser.add_argument("--piles", type=int, default=4)
     parser.add_argument("--out", type=Path, default=Path("build/plate_push"))
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / f"{options.push}.jsonl"
     lines = path.read_text().splitlines() if path.exists() else []
