@@ -20,7 +20,7 @@ from drakerock.laboratory.beds import (
 from drakerock.laboratory.config import DischargeSettings, LabSettings
 from drakerock.laboratory.interface import make_row
 from drakerock.laboratory.material import Material
-from drakerock.laboratory.results import Curve, Known, Panel, Row, Specimen, take_snapshot
+from drakerock.laboratory.results import Curve, Known, Panel, Row, Snapshot, Specimen, take_snapshot
 from drakerock.laboratory.scene import Scene, Slab
 from drakerock.laboratory.theory import BEVERLOO_K, calc_beverloo_rate, calc_hopper_factor
 from drakerock.rocks.state import PileState
@@ -88,7 +88,7 @@ class DischargeTest:
         room: Bin,
         seed: int,
         make_rig: MakeRig,
-    ) -> tuple[float, tuple[Array, Array], object]:
+    ) -> tuple[float, tuple[Array, Array], Snapshot]:
         """Return the rate [kg/s], its curve, and how it looks halfway."""
         lean = np.deg2rad(settings.hopper_angle_deg)
         walls = (*room.make_walls("lr", 0.0), *room.make_walls("ae", 0.0))

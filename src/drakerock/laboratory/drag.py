@@ -23,7 +23,7 @@ from drakerock.laboratory.beds import (
 from drakerock.laboratory.config import DragSettings, LabSettings, ShearSettings
 from drakerock.laboratory.interface import make_row
 from drakerock.laboratory.material import Material
-from drakerock.laboratory.results import Curve, Known, Panel, Row, Specimen, take_snapshot
+from drakerock.laboratory.results import Curve, Known, Panel, Row, Snapshot, Specimen, take_snapshot
 from drakerock.laboratory.scene import Mover, Scene, Slab
 from drakerock.laboratory.shear import ShearTest
 from drakerock.laboratory.theory import FEE_RESIDUAL, calc_blade_force
@@ -85,7 +85,7 @@ class DragTest:
         angle: float,
         seed: int,
         make_rig: MakeRig,
-    ) -> tuple[tuple[Array, Array, Array, Array, Array], object]:
+    ) -> tuple[tuple[Array, Array, Array, Array, Array], Snapshot]:
         d = material.mean_size
         travel = settings.travel * depth
         room = _make_bed(material, settings.rocks, travel + AHEAD * depth, depth + UNDER * d)
@@ -139,7 +139,7 @@ class DragTest:
         )
         moved = take_snapshot(rig.get_pile(), (blade,), (float(x[-1]), 0.0, 0.0))
         still = take_snapshot(rig.get_pile(), walls)
-        snapshot = type(moved)(moved.pile, still.slabs + moved.slabs)
+        snapshot = Snapshot(moved.pile, still.slabs + moved.slabs)
         return (measured, predicted, x, force, heaped), snapshot
 
     def evaluate(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -14,17 +14,19 @@ from drakerock.laboratory.results import Known, Panel, Row, Specimen
 
 
 class MaterialTest(Protocol):
-    """A test; it keeps nothing between calls.
+    """A test; it keeps nothing between calls."""
 
-    Attributes:
-        name: how it is called.
-        title: what it is, in a line.
-        settings: what it can be told.
-    """
+    @property
+    def name(self) -> str:
+        """How it is called."""
 
-    name: ClassVar[str]
-    title: ClassVar[str]
-    settings: ClassVar[type[LabSettings]]
+    @property
+    def title(self) -> str:
+        """What it is, in a line."""
+
+    @property
+    def settings(self) -> type[LabSettings]:
+        """What it can be told."""
 
     def measure(self, material: Material, settings: LabSettings, seed: int, make_rig: MakeRig) -> Specimen:
         """Make one specimen and test it."""

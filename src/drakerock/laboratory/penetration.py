@@ -14,7 +14,7 @@ from drakerock.laboratory.config import LabSettings, PenetrationSettings
 from drakerock.laboratory.interface import make_row
 from drakerock.laboratory.material import Material
 from drakerock.laboratory.repose import make_slope
-from drakerock.laboratory.results import Curve, Known, Panel, Row, Specimen, take_snapshot
+from drakerock.laboratory.results import Curve, Known, Panel, Row, Snapshot, Specimen, take_snapshot
 from drakerock.laboratory.scene import Mover, Scene, Slab
 from drakerock.laboratory.theory import INSERTION_EXPONENT
 from drakerock.rocks.state import PileState
@@ -88,7 +88,7 @@ class PenetrationTest:
         values["speed"] = totals[0] / totals[1] if totals[1] > 0 else float("nan")
         snapshot = take_snapshot(last, (*bench,))
         moved = take_snapshot(last, tool, (travel, 0.0, 0.0))
-        return Specimen(values, curves, type(snapshot)(last, snapshot.slabs + moved.slabs))
+        return Specimen(values, curves, Snapshot(last, snapshot.slabs + moved.slabs))
 
     def _find_top(self, height: float, d: float) -> float:
         return height + (BUCKET_HEIGHT * d if self.name == "bucket" else THICK * d)

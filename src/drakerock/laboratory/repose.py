@@ -100,7 +100,7 @@ class ReposeTest:
         pile = rig.get_pile()
         # The middle of the surface, by the box; seen from above.
         ends = np.array([0.25, 0.75]) * room.length * np.cos(tilt) - 0.8 * room.height * np.sin(tilt)
-        x = np.arange(*ends, 0.25 * material.mean_size)
+        x = np.arange(float(ends[0]), float(ends[1]), 0.25 * material.mean_size)
         after = float("nan")
         if len(x) > 2:
             after = float(np.arctan(np.polyfit(x, calc_profile(pile, material, x, 0.4 * room.width), 1)[0]))

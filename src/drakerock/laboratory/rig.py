@@ -79,9 +79,8 @@ class DrakeRig:
         own = CollisionFilterDeclaration().ExcludeWithin(GeometrySet(geometries))
         scene_graph.collision_filter_manager().Apply(own)
         self._sources = {mover.name: self._connect(builder, mover) for mover in scene.movers}
-        corners = np.vstack(
-            [slab.calc_corners() for part in (scene, *scene.movers) for slab in part.slabs] + [pile.p_WRs]
-        )
+        parts = (scene.slabs, *(mover.slabs for mover in scene.movers))
+        corners = np.vstack([slab.calc_corners() for slabs in parts for slab in slabs] + [pile.p_WRs])
         lower, upper = corners.min(axis=0) - MARGIN, corners.max(axis=0) + MARGIN
         lower[2] = max(lower[2], scene.floor)
         self._rocks = AddRocks(

@@ -13,7 +13,7 @@ from drakerock.laboratory.config import LabSettings, ShearSettings
 from drakerock.laboratory.interface import make_row
 from drakerock.laboratory.material import Material
 from drakerock.laboratory.results import Curve, Known, Panel, Row, Specimen, take_snapshot
-from drakerock.laboratory.scene import Mover, Scene, Slab
+from drakerock.laboratory.scene import Drive, Mover, Scene, Slab
 from drakerock.laboratory.theory import (
     calc_dilation,
     calc_rockfill_friction,
@@ -114,15 +114,14 @@ def _make_platens(spans: Array, drives: Mapping[str, str], mass: float, damping:
         at = 0.5 * spans
         near, far = at.copy(), at.copy()
         near[k], far[k] = -0.5 * t, spans[k] + 0.5 * t
-        unit = [0.0, 0.0, 0.0]
-        unit[k] = 1.0
+        unit = (float(k == 0), float(k == 1), float(k == 2))
         shape = (size[0], size[1], size[2])
         slabs.append(Slab(shape, tuple(near), friction=0.0))
         far_slab = Slab(shape, tuple(far), friction=0.0)
         if drives[axis] == "speed":
-            movers.append(Mover(axis, (far_slab,), tuple(unit)))
+            movers.append(Mover(axis, (far_slab,), unit))
         else:
-            movers.append(Mover(axis, (far_slab,), tuple(unit), drive="force", mass=mass, damping=damping))
+            movers.append(Mover(axis, (far_slab,), unit, drive="force", mass=mass, damping=damping))
     return Scene(tuple(slabs), tuple(movers), gravity=False, floor=-50.0)
 
 
@@ -172,7 +171,7 @@ def _shear(
     rig = make_rig(scene, pile, material)
     speed = settings.strain_rate * float(spans[2])
 
-    def drive_at(share: float) -> object:
+    def drive_at(share: float) -> Drive:
         def drive(travels: Mapping[str, float]) -> dict[str, float]:
             sides = spans + np.array([travels[axis] for axis in AXES])
             return {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +16,7 @@ from drakerock.laboratory.results import LabResult, Panel, Snapshot
 from drakerock.rocks.shapes import RockShape
 from drakerock.viewing.pile_figures import draw_rocks
 
-_STYLES = {
+_STYLES: dict[str, dict[str, Any]] = {
     "line": {"lw": 1.0},
     "points": {"ls": "none", "marker": "o"},
     "dashed": {"ls": "--", "color": "k", "lw": 1.2},
@@ -53,7 +54,7 @@ def draw_panel(ax: Axes, panel: Panel) -> Axes:
         if curve.style != "dashed" and (curve.label or number < 0):
             number += 1
             color = f"C{number % 10}"
-        style = {"color": color} | _STYLES[curve.style]
+        style: dict[str, Any] = {"color": color} | _STYLES[curve.style]
         ax.plot(curve.x, curve.y, label=curve.label or None, **style)
     ax.set_xlabel(panel.x_label)
     ax.set_ylabel(panel.y_label)
