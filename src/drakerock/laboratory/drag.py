@@ -31,8 +31,8 @@ from drakerock.rocks.config import GRAVITY
 
 Array = NDArray[np.float64]
 
-# Of the blade and of the bed under its edge [mean size].
-BLADE, UNDER = 0.2, 1.2
+# Of the blade, and its edge's gap over the floor [mean size]: rocks that fit under it would jam.
+BLADE, UNDER = 0.2, 0.06
 # Before the blade's last place there is so much of the bed, for the wedge [depth].
 AHEAD = 3.0
 # The force is taken after this share of the travel; forces are means over so many slices of it.
@@ -91,7 +91,7 @@ class DragTest:
         room = _make_bed(material, settings.rocks, travel + AHEAD * depth, depth + UNDER * d)
         level, tall = room.height, 40.0
         thick, edge = BLADE * d, level - depth
-        # The bed ends at the blade; under its edge a step holds it.
+        # The bed ends at the blade.
         step = Slab((THICKNESS, room.width, THICKNESS), (-0.5 * THICKNESS, 0.0, edge - 0.5 * THICKNESS))
         walls = (*room.make_walls("flre", 0.0), step)
         blade = Slab(
