@@ -308,6 +308,47 @@ def film(
     terminal.print_paths([out])
 
 
+@app.command()
+def lab(
+    test: Annotated[
+        str,
+        typer.Argument(
+            help="repose, shear, discharge, silo, settlement, plate, bucket or drag; see docs/laboratory.md."
+        ),
+    ],
+    scenario: ScenarioArgument = None,
+    out: OutOption = Path("out/lab"),
+    repeats: Annotated[int | None, typer.Option(help="Specimens, each of rocks of its own.")] = None,
+    with_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--with", metavar="KEY=VALUE", help="Change one of the test's settings, such as rocks=500."
+        ),
+    ] = None,
+    seed: SeedOption = None,
+    set_: SetOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """Test a scenario's rocks as a material, and hold them against what is known of broken rock.
+
+    Example: drakerock lab repose --out out/lab
+
+    Example: drakerock lab shear --with 'stresses_kPa=[50, 100]' --set rocks.friction=0.6
+    """
+    from drakerock.study.laboratory import run_and_save_test
+    from drakerock.viewing.lab_table import make_lab_table
+
+    overrides = [*(with_ or []), *([f"repeats={repeats}"] if repeats is not None else [])]
+    with terminal.show_progress("lab") as advance:
+        result, paths = run_and_save_test(test, _load(scenario, seed, set_), out, overrides, advance)
+    if json_:
+        print(json.dumps(result.to_dict()))
+        return
+    terminal.get_output().print(make_lab_table(result))
+    terminal.get_output().print(f"{result.facts['cpu_s']:g} CPU s")
+    terminal.print_paths(paths)
+
+
 machine_app = typer.Typer(no_args_is_help=True, help="The machine: its checks and its looks.")
 app.add_typer(machine_app, name="machine")
 

@@ -23,14 +23,13 @@ VIEWS = {"side": (0, 2, 1), "front": (1, 2, 0), "top": (0, 1, 2)}
 _TOWARDS_EYE = {"side": -1.0, "front": -1.0, "top": 1.0}
 
 
-def draw_pile(ax: Axes, pile: PileState, shapes: tuple[RockShape, ...], site: SiteConfig, view: str) -> Axes:
+def draw_rocks(ax: Axes, pile: PileState, shapes: tuple[RockShape, ...], view: str) -> Axes:
     """Draw the rocks' outlines, the nearest last, darker the farther away.
 
     Args:
         ax: where to draw.
         pile: the rocks.
         shapes: the rock shapes.
-        site: the drift, drawn as lines.
         view: a key of `VIEWS`; side looks along +y, front along +x (from the machine), top down.
     """
     across, up, depth = VIEWS[view]
@@ -46,6 +45,12 @@ def draw_pile(ax: Axes, pile: PileState, shapes: tuple[RockShape, ...], site: Si
     colors = matplotlib.colormaps["Greys_r"](0.35 + 0.5 * rank)
     colors[pile.fixed[order], :3] *= np.array([0.75, 0.85, 1.0])
     ax.add_collection(PolyCollection(outlines, facecolors=colors, edgecolors="0.15", linewidths=0.3))
+    return ax
+
+
+def draw_pile(ax: Axes, pile: PileState, shapes: tuple[RockShape, ...], site: SiteConfig, view: str) -> Axes:
+    """Draw the rocks (`draw_rocks`) in their drift, which is drawn as lines; otherwise as there."""
+    draw_rocks(ax, pile, shapes, view)
     half, end, height = 0.5 * site.drift_width, site.void_depth, site.drift_height
     if view == "side":
         start = min(float(pile.p_WRs[:, 0].min()) - 2.0, -3.0) if len(pile) else -3.0
