@@ -35,7 +35,7 @@ def write_cycle(folder, plan, recording, changes=()):
     save_signals(signals, dict.fromkeys(signals, "1"), folder / "signals.parquet")
     save_recording(recording, folder / "recording.npz")
     (folder / "outcome.json").write_text(json.dumps(OUTCOME | dict(changes)))
-    (folder / "scenario.json").write_text(Scenario().model_dump_json())
+    (folder / "scenario.json").write_text(Scenario().resolve().model_dump_json())
     return folder
 
 

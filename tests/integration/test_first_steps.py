@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from drakerock import cli
+from drakerock import terminal
 from drakerock.cli import app
 
 
@@ -38,14 +38,14 @@ def test_used_folder_is_refused(tmp_path):
     (tmp_path / "outcome.json").write_text("{}")
     result = CliRunner().invoke(app, ["load", "--out", str(tmp_path)])
     assert result.exit_code != 0
-    assert "--force replaces it" in str(result.exception)
+    assert "force it to be replaced" in str(result.exception)
 
 
 def test_ctrl_c_says_where_it_stopped_and_what_that_means(monkeypatch, capsys):
-    monkeypatch.setattr(cli, "console", Console(file=sys.stdout, width=100))
+    monkeypatch.setattr(terminal, "get_console", lambda: Console(file=sys.stdout, width=100))
 
     def work() -> None:
-        with cli._show_progress("load", "nothing was written to out") as advance:
+        with terminal.show_progress("load", "nothing was written to out") as advance:
             advance("s1", None, note="4.2 s simulated")
             raise KeyboardInterrupt
 
@@ -75,8 +75,8 @@ def test_values_of_a_sequence_take_the_terminals_width(monkeypatch, capsys, widt
         "events": {},
         "quantities": dict.fromkeys((*names, "wall_time_s"), row),
     }
-    monkeypatch.setattr(cli, "output", Console(file=sys.stdout, width=width))
-    cli._print_sequence(summary)
+    monkeypatch.setattr(terminal, "get_output", lambda: Console(file=sys.stdout, width=width))
+    terminal.print_sequence(summary)
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) == width
     if width == 200:

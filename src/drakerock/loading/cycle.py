@@ -265,7 +265,7 @@ def _make_rating(station: Station) -> MachineRating:
     """Return what the numbers of mining are relative to."""
     scenario = station.scenario
     return MachineRating(
-        payload=scenario.machine.expected.payload,
+        payload=scenario.machine.data.payload,
         capacity=calc_heaped_capacity(station.digger.bucket),
         loose_density=scenario.rocks.density * scenario.loading.performance.loose_packing,
         wheel_radius=station.digger.kinematics.wheel_radius,

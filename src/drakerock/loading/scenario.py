@@ -47,7 +47,9 @@ class Scenario(Config):
 
     def resolve(self) -> Scenario:
         """Return it with what it derives from the machine written out, as it is stored beside results."""
-        return self.replace(**{"loading.performance.tau_c": self.tau_c})
+        return self.replace(
+            **{"loading.performance.tau_c": self.tau_c, "machine.expected": self.machine.data}
+        )
 
     @model_validator(mode="after")
     def _check_critical_moment(self) -> Scenario:

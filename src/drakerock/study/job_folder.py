@@ -58,7 +58,7 @@ def _make_free(folder: Path, force: bool, sequence: bool) -> None:
     old += sorted(folder.glob("figure_*.png"))
     if old and not force:
         raise InputError(
-            f"{folder}: an earlier loading is there ({old[0].name}); --force replaces it, or take another folder"
+            f"{folder}: an earlier loading is there ({old[0].name}); take another folder, or force it to be replaced"
         )
     for path in old:
         path.unlink()

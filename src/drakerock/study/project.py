@@ -29,10 +29,10 @@ def make_machine_project(folder: Path, name: str, payload: float) -> list[Path]:
     """
     if not name.isidentifier():
         raise InputError(
-            f"--name {name}: letters, digits and _ only, no digit first: links and files are named so"
+            f"name {name}: letters, digits and _ only, no digit first: links and files are named so"
         )
     if not 500 <= payload <= 100_000:
-        raise InputError(f"--payload {payload / 1e3:g}: from 0.5 to 100 t")
+        raise InputError(f"payload {payload / 1e3:g}: from 0.5 to 100 t")
     _require_free(folder, "design.yaml", "scenario.yaml", f"{name}.sdf")
     known = SHIPPED_DATA.model_dump()
     factor = (payload / known["payload"]) ** (1 / 3)
@@ -73,7 +73,7 @@ def make_site_project(folder: Path, width: float, height: float) -> list[Path]:
     """
     if not (3.4 <= width <= 30 and LOWEST_ROOF <= height <= 20):
         raise InputError(
-            f"--width {width:g} --height {height:g}: 3.4 to 30 m wide (the LH621 needs 3.4) and {LOWEST_ROOF} to 20 m "
+            f"width {width:g}, height {height:g}: 3.4 to 30 m wide (the LH621 needs 3.4) and {LOWEST_ROOF} to 20 m "
             "high"
         )
     _require_free(folder, "scenario.yaml")

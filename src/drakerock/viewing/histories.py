@@ -33,11 +33,11 @@ class History:
 
 def make_histories(cycle: StoredCycle) -> list[History]:
     """Return the histories of a cycle; bucket load is nan where an older version did not store it."""
-    s = cycle.signals
+    s, payload = cycle.signals, get_payload(cycle)
     load = s.get("bucket_load", np.full(len(s["time"]), np.nan))
     tau_c = float(cycle.scenario["loading"]["performance"]["tau_c"])
     return [
-        History("load", "bucket load", "t", {"load": load / 1e3}, ("payload", get_payload(cycle) / 1e3)),
+        History("load", "bucket load", "t", {"load": load / 1e3}, payload and ("payload", payload / 1e3)),
         History(
             "force",
             "rocks on bucket",
@@ -55,6 +55,7 @@ def make_histories(cycle: StoredCycle) -> list[History]:
     ]
 
 
-def get_payload(cycle: StoredCycle) -> float:
-    """Return the machine's payload [kg]."""
-    return float(cycle.scenario["machine"]["expected"]["payload"])
+def get_payload(cycle: StoredCycle) -> float | None:
+    """Return the machine's payload [kg]; None if it is not known."""
+    payload = cycle.scenario["machine"]["expected"]["payload"]
+    return None if payload is None else float(payload)

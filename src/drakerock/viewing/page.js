@@ -424,8 +424,9 @@ class Chart {
   /** The load also as a share of the payload, and as fill factor. */
   addShares(run, r) {
     const place = this.runs.length > 1 ? `${"AB"[r]}.` : "";
-    const payload = run.histories[this.index].limit[1];
-    const shares = [["% of payload", "payload_share", 100 / payload, 0], ["fill factor", "fill_factor", run.fill_per_t, 2]];
+    const limit = run.histories[this.index].limit;
+    const shares = [["fill factor", "fill_factor", run.fill_per_t, 2]];
+    if (limit) shares.unshift(["% of payload", "payload_share", 100 / limit[1], 0]);
     for (const [label, key, factor, digits] of shares) {
       const field = document.createElement("span");
       field.innerHTML = key === "fill_factor" ? `<span></span> <b></b>` : `<b></b> <span></span>`;

@@ -37,7 +37,7 @@ class Result:
 def make_results(cycle: StoredCycle) -> list[Result]:
     """Return strategy and outcome of a cycle as numbers, the most wanted of the outcome first."""
     o = cycle.outcome
-    load = o.get("bucket_mass_kg")
+    load, payload = o.get("bucket_mass_kg"), get_payload(cycle)
     objectives = o.get("objectives") or {}
 
     def scale(value: float | None, factor: float | None) -> float | None:
@@ -46,7 +46,7 @@ def make_results(cycle: StoredCycle) -> list[Result]:
     return [
         *(Result(name, name, "", float(value), 2) for name, value in o["strategy"].items()),
         Result("load", "bucket load", "t", scale(load, 1e-3), 2),
-        Result("payload_share", "bucket load", "% of payload", scale(load, 100.0 / get_payload(cycle)), 0),
+        Result("payload_share", "bucket load", "% of payload", scale(load, payload and 100.0 / payload), 0),
         Result("fill_factor", "fill factor", "", scale(load, calc_fill_per_kg(cycle)), 2),
         Result("time", "loading time t4 - t0", "s", o.get("loading_time_s"), 2),
         Result("production", "production", "kg/s", objectives.get("production"), 0),
@@ -80,7 +80,8 @@ def make_title(cycle: StoredCycle) -> str:
     reason = cycle.outcome["reason"]
     if results["load"].value is None or results["time"].value is None:
         return f"{strategy}: {reason}"
+    share = f" ({results['payload_share'].show()} % of payload)" if results["payload_share"].value else ""
     return (
-        f"{strategy}: {results['load'].show()} t ({results['payload_share'].show()} % of payload) in "
+        f"{strategy}: {results['load'].show()} t{share} in "
         f"{results['time'].show()} s, damage {results['damage'].show()}, debris {results['debris'].show()} kg; {reason}"
     )

@@ -6,7 +6,7 @@ import pytest
 
 import study_work
 from drakerock.errors import InputError
-from drakerock.identity import calc_config_hash
+from drakerock.identity import RESULTS_REVISION, calc_config_hash
 from drakerock.loading.scenario import Scenario
 from drakerock.loading.sequence import _read_loading
 
@@ -18,5 +18,7 @@ def test_loadings_of_other_inputs_or_versions_are_refused(tmp_path, monkeypatch)
     place = tmp_path / "loading_00"
     with pytest.raises(InputError, match="of another scenario"):
         _read_loading(place, calc_config_hash(scenario.replace(seed=1)))
-    with pytest.raises(InputError, match=r"made by other versions .*results 1 .*; take another folder"):
+    with pytest.raises(
+        InputError, match=rf"made by other versions .*results {RESULTS_REVISION} .*; take another folder"
+    ):
         _read_loading(place, calc_config_hash(scenario))

@@ -170,11 +170,12 @@ def test_a_study_can_grow_but_not_change(copy):
 def test_a_study_whose_files_or_program_changed_is_another(tmp_path, monkeypatch):
     model = tmp_path / "machine.sdf"
     model.write_text("<sdf/>")
-    study = make_study(f"scenario.machine.model={model}")
+    known = "scenario.loading.performance.tau_c=1e5"
+    study = make_study(f"scenario.machine.model={model}", known)
     Store.create(tmp_path / "store", study).close()
     Store.create(tmp_path / "store", study).close()
     same = shutil.copy(model, tmp_path / "copy.sdf")
-    Store.create(tmp_path / "store", make_study(f"scenario.machine.model={same}")).close()
+    Store.create(tmp_path / "store", make_study(f"scenario.machine.model={same}", known)).close()
     with monkeypatch.context() as patch:
         patch.setattr(db, "RESULTS_REVISION", db.RESULTS_REVISION + 1)
         with pytest.raises(InputError, match=r"another study \(different: results revision\)"):
