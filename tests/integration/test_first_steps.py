@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from drakerock import terminal
 from drakerock.cli import app
+from drakerock.loading.mining import MINING
 
 
 def test_command_alone_says_what_to_do_first_and_the_module_is_the_command():
@@ -73,7 +74,8 @@ def test_values_of_a_sequence_take_the_terminals_width(monkeypatch, capsys, widt
         "loadings": 8,
         "strategy": {"alpha": 1.1},
         "events": {},
-        "quantities": dict.fromkeys((*names, "wall_time_s"), row),
+        "payload_spread_percent": 4.0,
+        "quantities": dict.fromkeys((*names, *MINING, "wall_time_s"), row),
     }
     monkeypatch.setattr(terminal, "get_output", lambda: Console(file=sys.stdout, width=width))
     terminal.print_sequence(summary)
