@@ -12,9 +12,11 @@ of the mean heading phi = (l_a theta_a + l_b theta_b) / L it is gone. For small 
 
     de/du = phi + (l_b / L) gamma,    dphi/du = gamma / L,
 
-and gamma = -L (k_1 e + k_2 phi) gives a closed loop with trace -(k_2 + l_b k_1) and determinant k_1: it is stable if and
-only if k_1 > 0 and k_2 > -l_b k_1. The choice k_1 = 1 / P^2, k_2 = 2 / P - l_b / P^2 puts both poles at -1 / P, for
-each preview distance P and each direction: no overshoot from a parallel start, e = e_0 (1 + (1 - l_b / P) u / P) exp(-u / P).
+and gamma = -L (k_1 e + k_2 phi) gives a closed loop with trace -(k_2 + l_b k_1) and determinant k_1: it is stable
+if and only if k_1 > 0 and k_2 > -l_b k_1. The choice k_1 = 1 / P^2, k_2 = 2 / P - l_b / P^2 puts both poles at -1 / P,
+for each preview distance P and each direction. From a parallel start at e_0, and P >= l_b, there is no overshoot:
+
+    e = e_0 (1 + (1 - l_b / P) u / P) exp(-u / P).
 
 Two things have to be so. The fed-back heading is phi, not that of one unit: with theta_a in its place the bend feeds
 back on itself, and with the front unit's while driving in reverse the loop gain 1 - 2 l_r / P turns negative for
@@ -85,9 +87,9 @@ STEERED = (Mode.APPROACH, Mode.S3)
 class LineSteering(LeafSystem):
     """Steers the articulation so that the machine drives along the plan's line y = const.
 
-    It steers on the way to the pile and out of it. While the bucket is in the pile, from s0 to s3, and while the machine
-    stands, the angle is held: there the rocks turn the machine, its tyres slide, and bending it pushes the rear unit
-    towards the wall instead of turning the bucket. The angle turns no faster than `rate_deg`.
+    It steers on the way to the pile and out of it, no faster than `rate_deg`. While the bucket digs, from s0 to s3,
+    and while the machine stands, the angle is held: there the rocks turn the machine, its tyres slide, and the
+    kinematics above do not hold.
 
     Input ports:
         ``plan``: abstract, a `DigPlan` or `NoPlan`.

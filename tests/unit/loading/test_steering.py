@@ -28,7 +28,7 @@ from drakerock.loading.steering import LineSteering, calc_steering_angle, measur
 L_FRONT, L_REAR, LIMIT = 2.35, 2.1, math.radians(15)
 STEP = 0.01
 TURN = math.radians(8.0) * STEP / 1.3
-"""Largest turn of the articulation over a step of the way: a hinge that turns at 8 deg/s while the machine drives at 1.3 m/s [rad]."""
+"""Largest turn of the hinge over a step of the way: at 8 deg/s while the machine drives at 1.3 m/s [rad]."""
 
 
 def drive(
