@@ -73,9 +73,9 @@ def test_tyres_that_spin_give_way_sideways(effort, spins):
     """
     wall = Obstacle(Box(2.0, 20.0, 4.0), (1.05, 0.0, 0.0), 0.001)
     bench = make(MachineConfig(wheel=WheelConfig(effort=effort)), obstacle=wall)
-    place(bench, x_tip=0.0)
+    place(bench, x_tip=0.0, z_tip=0.2)
     bench.apply_force("bucket", np.array([1.9, 0.0, -0.3]), np.array([0.0, 60e3, 0.0]))
-    bench.run(0.5, wheel=1.3)
+    bench.run(0.8, wheel=1.3)
     start, _ = get_heading(bench)
     record = bench.run(0.4, wheel=1.3)
     end, _ = get_heading(bench)
