@@ -111,7 +111,8 @@ class SteeringConfig(Config):
     hold_line: Annotated[
         bool,
         Field(
-            description="steer back to the plan's line; false: the angle machine.steering_angle_deg is held"
+            description="steer back to the plan's line before s0 and after s3; false: the angle "
+            "machine.steering_angle_deg is held"
         ),
     ] = False
     preview: Annotated[

@@ -228,7 +228,7 @@ def make_station(
     builder.Connect(motor_speeds, motors.GetInputPort("motor_speeds"))
     if loading.steering.hold_line and not controller_system.HasOutputPort("steering_angle"):
         steering = builder.AddSystem(LineSteering(plant, machine, loading.steering))
-        connect_inputs(builder, "steering", steering, signals | {"motor_speeds": motor_speeds})
+        connect_inputs(builder, "steering", steering, signals)
         builder.Connect(steering.GetOutputPort("steering_angle"), motors.GetInputPort("steering_angle"))
     elif controller_system.HasOutputPort("steering_angle"):
         builder.Connect(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydrake.geometry import Box
 from pydrake.math import RollPitchYaw
 
-from drakerock.lhd.checks.bench import Bench, CheckConfig, make_bench
-from drakerock.lhd.config import FunctionConfig, MachineConfig
+from drakerock.lhd.checks.bench import Bench, CheckConfig, Obstacle, make_bench
+from drakerock.lhd.config import FunctionConfig, MachineConfig, WheelConfig
 from drakerock.lhd.kinematics import calc_bucket_range, calc_joint_angles, calc_joint_rates, calc_tip
 from drakerock.lhd.placement import set_machine_angles, set_machine_pose
 
@@ -62,6 +63,29 @@ def test_steered_machine_turns():
     # The rear unit's angle -20 deg puts the centre of the turn to the left.
     assert yaw > 0.2
     assert position[1] > 0.3
+
+
+@pytest.mark.parametrize(("effort", "spins"), [(None, True), (100e3, False)])
+def test_tyres_that_spin_give_way_sideways(effort, spins):
+    """Bucket at a smooth wall, 60 kN sideways on it, a tenth of the grip: friction points along the slip.
+
+    Tyres that spin oppose the side force only as far as they slide sideways too; tyres that grip hold it.
+    """
+    wall = Obstacle(Box(2.0, 20.0, 4.0), (1.05, 0.0, 0.0), 0.001)
+    bench = make(MachineConfig(wheel=WheelConfig(effort=effort)), obstacle=wall)
+    place(bench, x_tip=0.0, z_tip=0.2)
+    bench.apply_force("bucket", np.array([1.9, 0.0, -0.3]), np.array([0.0, 60e3, 0.0]))
+    bench.run(0.8, wheel=1.3)
+    start, _ = get_heading(bench)
+    record = bench.run(0.4, wheel=1.3)
+    end, _ = get_heading(bench)
+    wheel = bench.get_rate(record, "wheel_front_left_joint")[-1]
+    assert (wheel > 0.1) == spins
+    assert record.tyre_force[-1, :, 1].sum() == pytest.approx(-60e3, rel=0.1)
+    if spins:
+        assert (end - start)[1] / 0.4 > 0.01
+    else:
+        assert abs((end - start)[1]) / 0.4 < 0.001
 
 
 @pytest.mark.parametrize("holds", [True, False])
