@@ -162,7 +162,7 @@ def _judge_one(accuracy: Accuracy, n_points: int, sizes: Array, nrmse: Array) ->
     floor = accuracy.noise_floor
     noise = floor**2 if np.isfinite(floor) else 0.0
     error = float(np.sqrt(max(total**2 - noise, 0.0)))
-    true_spread = float(np.var(compared.simulated)) / accuracy.value_range**2 - noise
+    true_spread = float(np.var(compared.simulated / accuracy.value_range)) - noise
     constant = float(np.ptp(compared.simulated)) == 0.0
     share = float("nan") if true_spread <= 0.0 else 1.0 - error**2 / true_spread
     coverage = compared.calc_coverage(COVERAGE_LEVELS[-1])
