@@ -24,7 +24,9 @@ from drakerock.resources import find_data
 from drakerock.study.resimulation import Resimulation
 from drakerock.study.runner import run_study
 from drakerock.study.schema import StudyConfig
+from drakerock.viewing import report
 from drakerock.yaml_reader import YamlDocument
+from report_helpers import save_confirmation
 
 STUDY = """
 name: trial
@@ -53,6 +55,7 @@ def store(finished, tmp_path, monkeypatch):
     """A copy of the finished study, `store` in the working folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(study_work, "DURATION", 0.0)
+    monkeypatch.setattr(report, "save_figures", save_confirmation)
     for function in (run_study, Resimulation.__init__):
         monkeypatch.setitem(function.__kwdefaults__, "work", "study_work:run")
     Path("trial.yaml").write_text(STUDY)

@@ -15,8 +15,13 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from threadpoolctl import threadpool_limits
 
+import study_work
+from drakerock.config import parse_config
 from drakerock.study.db import Store
+from drakerock.study.runner import run_study
+from drakerock.study.schema import StudyConfig
 from drakerock.study.status import read_status
 from drakerock.study.verify import verify_store
 
@@ -27,7 +32,9 @@ seed: 3
 loadings: 4
 exploration:
   sampling: {n_initial: 6, n_corners: 4, n_samples: 19, n_validation: 5, batch_size: 3}
+  surrogate: {n_starts: 1}
 """
+SERIAL = "executor: {kind: serial}\n"
 N_CYCLES = 96
 
 
@@ -75,6 +82,13 @@ class Place:
     def run(self, *args, **values):
         return self.finish(self.start(*args, **values))
 
+    def run_here(self):
+        """Run the study in this process, which has imported everything, to its end."""
+        with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
+            patch.setattr(study_work, "LOG", str(self.log))
+            patch.setattr(study_work, "DURATION", 0.0)
+            run_study(parse_config(STUDY + SERIAL, StudyConfig), self.out, work="study_work:run")
+
     def count(self, word):
         lines = self.log.read_text().splitlines() if self.log.exists() else []
         return Counter(line.split()[1] for line in lines if line.startswith(word))
@@ -108,7 +122,7 @@ class Place:
 def reference(tmp_path_factory):
     """The store of an uninterrupted run in one process."""
     place = Place(tmp_path_factory.mktemp("reference"))
-    place.run("--set", "executor.kind=serial")
+    place.run_here()
     assert place.check(place.out, 0) == 0
     return place.out
 
@@ -133,7 +147,7 @@ def find_workers(process):
 
 
 def kill_main_often(place, reference, n_kills, seed, longest):
-    (place.folder / "study.yaml").write_text(STUDY + "executor: {kind: serial}\n")
+    (place.folder / "study.yaml").write_text(STUDY + SERIAL)
     result = subprocess.run(
         [sys.executable, "-W", "ignore", str(TESTS / "study_killer.py"), "study.yaml", "out", str(n_kills),
          str(seed), str(longest)],
@@ -270,7 +284,7 @@ def test_ctrl_c_once_lets_the_running_cycles_finish(place, reference):
     assert not status["running"]
     assert status["last_run"]["ending"] == "interrupted"
     assert status["cycles"]["recorded"] == place.count("finish").total() < N_CYCLES
-    place.run("--workers", "1")
+    place.run_here()
     assert place.check(reference, 0) == 0
 
 
@@ -386,35 +400,31 @@ def test_a_lost_scheduler(place, reference):
     place.check(reference, 1)
 
 
-def test_no_scheduler_at_that_address(place):
-    process = place.start("--scheduler", "tcp://127.0.0.1:1")
-    _, err = place.finish(process, code=2)
+def test_no_scheduler_at_that_address(place, run_command, monkeypatch):
+    monkeypatch.chdir(place.folder)
+    code, _, err = run_command(
+        "study", "run", "study.yaml", "--out", "out", "--scheduler", "tcp://127.0.0.1:1"
+    )
+    assert code == 2
     assert "no Dask scheduler there" in err
 
 
 def test_a_full_disk(place, reference):
     """A file system of its own, too small: the run stops with the reason; with more room it goes on."""
-    out = place.out
-    out.mkdir()
-    script = f"""
-        mount -t tmpfs -o size=700k tmpfs {out} || exit 77
-        {sys.executable} {TESTS / "study_command.py"} study run study.yaml --out out --set executor.kind=serial
-        echo first $?
-        mount -o remount,size=50m {out}
-        {sys.executable} {TESTS / "study_command.py"} study run study.yaml --out out --set executor.kind=serial
-        echo second $?
-        cp -r {out} {place.folder}/kept
-    """
+    place.out.mkdir()
+    script = TESTS / "study_on_small_disk.py"
     result = subprocess.run(
-        ["unshare", "-rm", "bash", "-c", script], cwd=place.folder,
+        ["unshare", "-rm", sys.executable, script, "study.yaml", place.out, "700k", "50m"], cwd=place.folder,
         env=make_environment(place.log, STUDY_WORK_SECONDS="0", STUDY_WORK_BYTES="20000"),
         capture_output=True, text=True, check=False, timeout=120,
     )  # fmt: skip
-    if "first" not in result.stdout:
+    if result.returncode == 77 or "unshare" in result.stderr:
         pytest.skip(f"no file system of one's own here: {result.stderr.strip()}")
     assert re.search(r"No space left|disk is full", result.stderr), result.stderr
-    assert "first 0" not in result.stdout
     assert "Traceback" not in result.stderr
-    assert "second 0" in result.stdout, result.stderr
+    ended = re.search(r"ended with (-?\d+) (-?\d+)", result.stdout)
+    assert ended, result.stderr
+    assert int(ended[1]) != 0
+    assert int(ended[2]) == 0, result.stderr
     place.out = place.folder / "kept"
     assert place.check(reference, 1) <= 1

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from drakerock.errors import InputError
 from drakerock.exploration.table import ResponseTable
+from drakerock.loading.folder import REPLAY
 from drakerock.study.db import Store
-from drakerock.viewing.replay import REPLAY, write_replay
 
 
 def write_study_replays(
@@ -42,6 +42,8 @@ def write_study_replays(
 
 def update_replay(place: Path, loadings: int = 1) -> Path:
     """Write a loading's replay unless there is one that is newer than its recording; return its path."""
+    from drakerock.viewing.replay import write_replay  # takes long to import
+
     page = place / REPLAY
     if not page.exists() or page.stat().st_mtime < (place / "recording.npz").stat().st_mtime:
         write_replay(place, loadings=loadings)

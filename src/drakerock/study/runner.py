@@ -22,9 +22,7 @@ import numpy as np
 
 from drakerock.errors import InputError, RunStopped
 from drakerock.exploration.problem import Array
-from drakerock.exploration.sampling import make_sampler, make_validation_points
 from drakerock.identity import get_versions
-from drakerock.rocks.engine.compiling import are_kernels_compiled, describe_compilation
 from drakerock.study.db import Point, Store
 from drakerock.study.display import Display
 from drakerock.study.executors import Executor, Losses, WorkerLost, make_executor
@@ -138,8 +136,11 @@ class _Runner:
             if executor.dashboard:
                 self._display.say(f"Dask dashboard: {executor.dashboard}")
             nonsmooth = self._study.scenario.dynamics.rocks == "nonsmooth"
-            if executor.local and nonsmooth and self._work == RUN_SEQUENCE and not are_kernels_compiled():
-                self._display.say(describe_compilation())
+            if executor.local and nonsmooth and self._work == RUN_SEQUENCE:
+                from drakerock.rocks.engine.compiling import are_kernels_compiled, describe_compilation
+
+                if not are_kernels_compiled():
+                    self._display.say(describe_compilation())
 
     def _ask_to_stop(self) -> None:
         self._stop_file.touch()
@@ -177,6 +178,8 @@ class _Runner:
         config = study.exploration.sampling
         validation = store.list_points("validation")
         if len(validation) < config.n_validation:
+            from drakerock.exploration.sampling import make_validation_points  # takes long to import
+
             X = make_validation_points(study.problem, config, study.seed)
             store.add_points("validation", 0, X[len(validation) :])
             validation = store.list_points("validation")
@@ -198,6 +201,8 @@ class _Runner:
 
     def _ask(self, samples: list[Point], awaited: set[str]) -> Array:
         """Return the points of the next step, from the responses of the points `awaited` and the places of all."""
+        from drakerock.exploration.sampling import make_sampler  # takes long to import
+
         config, n_samples = self._study.exploration.sampling, len(samples)
         sampler = make_sampler(self._study.problem, config, self._study.seed)
         if n_samples == 0:

@@ -6,8 +6,8 @@ import json
 import sqlite3
 from dataclasses import dataclass
 
+from drakerock.loading.folder import REPLAY
 from drakerock.study.db import DATABASE, POINTS, STUDY, Store, hash_file, write_neutral
-from drakerock.viewing.replay import REPLAY
 
 
 @dataclass(frozen=True)

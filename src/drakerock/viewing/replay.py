@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydrake.common import FindResourceOrThrow
 
 from drakerock.files import write_text
+from drakerock.loading.folder import REPLAY
 from drakerock.loading.recording import Recording
 from drakerock.viewing.histories import make_histories
 from drakerock.viewing.packing import compress, pack
@@ -25,7 +26,6 @@ from drakerock.viewing.tracks import PoseGrid, join_tracks, make_body_tracks, ma
 
 Array = NDArray[np.float64]
 
-REPLAY = "replay.html"
 # So much of the void is in the picture [m].
 _BEHIND_BROW = 1.5
 # So much of the machine is in the picture when the tip enters the pile [m].

@@ -1,4 +1,5 @@
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -9,7 +10,11 @@ from drakerock.cli import app
 from drakerock.errors import InputError
 from drakerock.exploration.config import ExplorationConfig, ParetoConfig, SensitivityConfig, SurrogateConfig
 from drakerock.exploration.problems import make_noisy_loading, make_noisy_table
+from drakerock.exploration.surrogate import Surrogate
+from drakerock.study import analysis
 from drakerock.study.analysis import run_confirm, run_report, run_strategy
+from drakerock.viewing import report
+from report_helpers import save_confirmation
 
 KNOWN = make_noisy_loading()
 QUICK = ExplorationConfig(
@@ -33,6 +38,29 @@ def folder(tmp_path_factory):
     study = {"name": "trial", "seed": 5, "exploration": QUICK.model_dump(mode="json")}
     (folder / "study.json").write_text(json.dumps(study))
     return folder
+
+
+def remember(function):
+    """Return a function that calls `function` once for each choice of arguments, but for what to tell the progress."""
+    known = {}
+
+    def call(*args):
+        args = [arg for arg in args if not callable(arg)]
+        key = tuple(id(arg) if isinstance(arg, Surrogate) else pickle.dumps(arg) for arg in args)
+        if key not in known:
+            known[key] = function(*args)
+        return known[key]
+
+    return call
+
+
+@pytest.fixture(scope="module", autouse=True)
+def fitted_once():
+    """The study of `folder` is fitted, judged and searched once, whoever asks."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("fit_surrogate", "calc_learning_curve", "pareto_front"):
+            patch.setattr(analysis, name, remember(getattr(analysis, name)))
+        yield
 
 
 @pytest.fixture
@@ -95,13 +123,29 @@ def test_bounds_and_knee(folder, run):
     assert knee["chosen_by"] == "knee point"
 
 
-def test_a_table_alone_will_do(folder, tmp_path):
+def test_a_table_alone_will_do(folder, tmp_path, monkeypatch):
+    """The settings are the defaults; here they are but looked at, as they take long."""
+    given = []
+
+    def use_quick(name, quick):
+        function = getattr(analysis, name)
+
+        def call(*args):
+            given.extend(arg for arg in args if isinstance(arg, type(quick)))
+            return function(*(quick if isinstance(arg, type(quick)) else arg for arg in args))
+
+        monkeypatch.setattr(analysis, name, call)
+
+    use_quick("fit_surrogate", QUICK.surrogate)
+    use_quick("pareto_front", QUICK.pareto)
     path = tmp_path / "points.csv"
     path.write_bytes((folder / "responses.csv").read_bytes())
     assert run_strategy(path, "production=1").y[0] > 190.0
+    assert given == [SurrogateConfig(), ParetoConfig()]
 
 
-def test_confirm_then_report(folder, run):
+def test_confirm_then_report(folder, run, monkeypatch):
+    monkeypatch.setattr(report, "save_figures", save_confirmation)
     result = run("study", "confirm", folder, "--points", "3")
     assert result.exit_code == 0, result.output
     assert result.stdout.count("point ") == 3
