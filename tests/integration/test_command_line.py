@@ -126,7 +126,7 @@ def test_sequence_writes_loadings_and_summary_and_goes_on(place, sequence):
     (first, _), (second, _) = sequence
     assert first.exit_code == 0, first.output
     assert second.exit_code == 0, second.output
-    assert "standard error" in second.stdout
+    assert "spread" in second.stdout
     assert "production [kg/s]" in second.stdout
     assert f"wrote {place}/sequence/loading_01" in second.stdout
     summary = json.loads((place / "sequence" / "sequence.json").read_text())
@@ -259,7 +259,18 @@ def test_pile_command(place, run):
             ["load", "small.yaml", "--set", "machine.model=nothing.sdf"],
             ["machine.model", "nothing.sdf", "no such file"],
         ),
-        (["load", "small.yaml", "--set", "machine.model=broken.sdf"], ["broken.sdf:1", "no valid XML"]),
+        (["load", "small.yaml", "--set", "machine.model=broken.sdf"], ["critical_moment", "broken.sdf"]),
+        (
+            [
+                "load",
+                "small.yaml",
+                "--set",
+                "machine.model=broken.sdf",
+                "--set",
+                "loading.performance.tau_c=1e5",
+            ],
+            ["broken.sdf:1", "no valid XML"],
+        ),
         (["load", "small.yaml", "--set", "pile.source=nothing.npz"], ["nothing.npz", "no such file"]),
         (["load", "small.yaml", "--set", "pile.source=broken.npz"], ["broken.npz", "not a readable"]),
         (["load", "small.yaml", "--set", "rocks.shapes=[broken.sdf]"], ["rocks.shapes", "broken.sdf"]),

@@ -54,6 +54,9 @@ class Scenario(Config):
     @model_validator(mode="after")
     def _check_critical_moment(self) -> Scenario:
         if self.loading.performance.tau_c is None and self.machine.data.critical_moment is None:
+            model = self.machine.model
+            if "://" not in model and not Path(model).exists():
+                raise ValueError(f"machine.model: {model}: no such file")
             raise ValueError(
                 f"machine.expected.critical_moment: what moment the bucket's hinge of {self.machine.model} may carry "
                 "is not known, and the damage measure needs it; give it here [N m], or as loading.performance.tau_c"

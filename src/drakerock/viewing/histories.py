@@ -37,7 +37,13 @@ def make_histories(cycle: StoredCycle) -> list[History]:
     load = s.get("bucket_load", np.full(len(s["time"]), np.nan))
     tau_c = float(cycle.scenario["loading"]["performance"]["tau_c"])
     return [
-        History("load", "bucket load", "t", {"load": load / 1e3}, payload and ("payload", payload / 1e3)),
+        History(
+            "load",
+            "bucket load",
+            "t",
+            {"load": load / 1e3},
+            None if payload is None else ("payload", payload / 1e3),
+        ),
         History(
             "force",
             "rocks on bucket",
