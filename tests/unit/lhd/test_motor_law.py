@@ -160,7 +160,7 @@ def test_loaded_wheel_settles_on_its_curve(motor, load, inertia):
 
 
 @given(
-    loads=st.lists(st.floats(-2e5, 1e5), min_size=10, max_size=40),
+    loads=st.lists(st.floats(-2e5, 1e5), min_size=10, max_size=20),
     inertia=st.floats(WHEEL, 5e4),
     motor=st.sampled_from([LINEAR, KNEE]),
 )
