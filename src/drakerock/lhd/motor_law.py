@@ -4,7 +4,7 @@ In a step of length h a motor's torque on its joint, whose rate is v before the 
 
     clamp(D (w - v') + u, -P, P) + b,
 
-an actuator with velocity gain D and peak torque P, which the solvers of plant and rocks treat implicitly, a
+an actuator with velocity gain D and largest torque P, which the solvers of plant and rocks treat implicitly, a
 feed-forward u and a bias b that shifts the window of what it can give. D and P stay; w, u and b are chosen in each
 step, from the command, the rate v, and torque and rate of the step before:
 
@@ -78,6 +78,15 @@ class Motor:
         """The largest torque of all [N m]."""
         return max(self.effort, self.relief) if self.holds else self.effort
 
+    @property
+    def half_window(self) -> float:
+        """Half of what the actuator spans [N m]: P.
+
+        The lower one of a function's two limits, so that neither side of a shifted window lies beyond its limit; at
+        least half of the higher one, so that it has both signs.
+        """
+        return max(min(self.effort, self.relief), 0.5 * self.peak) if self.holds else self.effort
+
     def calc_limit(self, rate: float) -> float:
         """Return the largest torque [N m] of a moving motor at a rate [rad/s] in the torque's direction."""
         if not self.curve:
@@ -129,5 +138,5 @@ class Motor:
             target, carried, side = wanted, 0.0, np.sign(wanted - rate)
             # Brakes have their whole torque on either side.
             limit = self.effort if abs(wanted) <= DEADBAND else self.find_step_limit(side, rate, before)
-        bias = float(side * (limit - self.peak))
+        bias = float(side * (limit - self.half_window))
         return MotorCommand(target, carried - bias, bias)

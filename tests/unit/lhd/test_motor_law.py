@@ -26,12 +26,15 @@ def step(motor, command, load, inertia, rate):
     offset = command.bias + load
     for fixed, slope in (
         (motor.damping * command.rate + command.feedforward, motor.damping),
-        (motor.peak, 0.0),
-        (-motor.peak, 0.0),
+        (motor.half_window, 0.0),
+        (-motor.half_window, 0.0),
     ):
         end = (inertia * rate + STEP * (fixed + offset)) / (inertia + STEP * slope)
         acting = motor.damping * (command.rate - end) + command.feedforward
-        if abs(np.clip(acting, -motor.peak, motor.peak) - (fixed - slope * end)) <= 1e-6 * motor.peak:
+        if (
+            abs(np.clip(acting, -motor.half_window, motor.half_window) - (fixed - slope * end))
+            <= 1e-6 * motor.peak
+        ):
             return end, fixed - slope * end + command.bias
     raise AssertionError("no piece of the law fits")
 
