@@ -30,9 +30,10 @@ def run(station, simulator, steps: int) -> tuple[np.ndarray, np.ndarray]:
     instance = station.machine.instance
     place = list(plant.GetActuatorNames(instance)).index("boom_joint")
     joint = plant.GetJointByName("boom_joint", instance)
+    motors = station.diagram.GetSubsystemByName("motors")
     rows = []
     for _ in range(steps):
-        torque = plant.get_net_actuation_output_port(instance).Eval(plant_context)[place]
+        torque = motors.GetOutputPort("motor_torques").Eval(motors.GetMyContextFromRoot(context))[place]
         rows.append((joint.get_angle(plant_context), torque))
         simulator.AdvanceTo(context.get_time() + plant.time_step())
     return tuple(np.array(rows).T)

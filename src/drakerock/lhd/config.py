@@ -19,6 +19,10 @@ class MotorConfig(Config):
     )
 
 
+RELIEF_SHARE = 1.07
+"""Relief of a closed valve over the effort, as port reliefs stand above the pump's: docs/machine.md has the source."""
+
+
 class FunctionConfig(MotorConfig):
     """A hydraulic function: the boom's lift or the bucket's tilt."""
 
@@ -31,7 +35,9 @@ class FunctionConfig(MotorConfig):
         default=True, description="a load does not push it back against its command, if it holds"
     )
     relief: float | None = Field(
-        default=None, gt=0, description="torque at which the closed valve yields [N m]; none: the effort"
+        default=None,
+        gt=0,
+        description=f"torque at which the closed valve yields [N m]; none: {RELIEF_SHARE} times the effort",
     )
 
 

@@ -8,11 +8,18 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
+from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains, RevoluteJoint
 
 from drakerock.errors import InputError
 from drakerock.lhd import names
-from drakerock.lhd.config import NO_LOAD_SHARE, FunctionConfig, MachineConfig, MotorConfig, WheelConfig
+from drakerock.lhd.config import (
+    NO_LOAD_SHARE,
+    RELIEF_SHARE,
+    FunctionConfig,
+    MachineConfig,
+    MotorConfig,
+    WheelConfig,
+)
 from drakerock.lhd.model_file import Loop, check_machine_file, parse_machine
 from drakerock.lhd.motor_law import Motor
 
@@ -97,13 +104,20 @@ def _apply_motor(
     velocity = float(joint.velocity_upper_limits()[0]) if config.velocity is None else config.velocity
     motor = Motor(effort, velocity, damping)
     if isinstance(config, FunctionConfig):
-        relief = effort if config.relief is None else config.relief
+        relief = RELIEF_SHARE * effort if config.relief is None else config.relief
         motor = replace(motor, holds=config.holds, check_valve=config.check_valve, relief=relief)
     elif isinstance(config, WheelConfig) and config.torque_curve:
         no_load = NO_LOAD_SHARE * velocity if config.no_load_speed is None else config.no_load_speed
         curve = tuple((no_load * rate, effort * torque) for rate, torque in config.torque_curve)
-        motor = replace(motor, curve=curve)
-    actuator.set_effort_limit(motor.peak)
+        motor = replace(motor, curve=curve, inertia=_calc_inertia(joint), time_step=plant.time_step())
+    actuator.set_effort_limit(motor.half_window)
     actuator.set_controller_gains(PdControllerGains(p=0.0, d=damping))
-    joint.set_default_damping_vector(joint.default_damping_vector() + motor.drag)
     return motor
+
+
+def _calc_inertia(joint: RevoluteJoint) -> float:
+    """Return what the joint's child alone has about the joint's axis [kg m^2]."""
+    X_BJ = joint.frame_on_child().GetFixedPoseInBodyFrame()
+    inertia = joint.child_body().default_spatial_inertia().Shift(X_BJ.translation())
+    axis = X_BJ.rotation() @ joint.revolute_axis()
+    return float(axis @ inertia.CalcRotationalInertia().CopyToFullMatrix3() @ axis)

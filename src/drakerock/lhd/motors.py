@@ -15,12 +15,9 @@ from pydrake.systems.framework import (
 )
 
 from drakerock.errors import InputError
-from drakerock.lhd import names
 from drakerock.lhd.model import Machine
-from drakerock.lhd.motor_law import MotorCommand
+from drakerock.lhd.motor_law import MotorCommand, MotorState
 from drakerock.memory import weak
-
-Array = np.ndarray
 
 
 class Motors(LeafSystem):
@@ -35,10 +32,10 @@ class Motors(LeafSystem):
     Output ports, for the plant's input ports of these names:
         ``desired_state``: positions (only the articulation's counts) and rates of the actuators, in Drake's order.
         ``actuation``: feed-forward torques in that order [N m].
-        ``applied_generalized_force``: (v,) of the whole plant: the biases, also as
-        ``bias``: in the actuators' order [N m].
+        ``applied_generalized_force``: (v,) of the whole plant: the biases.
+    And ``motor_torques``: what the actuators give over the step that begins, in that order [N m].
 
-    State: the torques of boom and bucket in the step before [N m].
+    State, in the actuators' order: torques [N m] in the step before, and the joints' rates [rad/s] at its beginning.
     """
 
     def __init__(self, plant: MultibodyPlant, machine: Machine) -> None:
@@ -60,7 +57,6 @@ class Motors(LeafSystem):
         )
         row = {int(v): plant.num_positions(machine.instance) + k for k, v in enumerate(velocities)}
         self._rates = [row[start] for start in self._starts]
-        self._functions = [joints.index(name) for name in of_joint]
         n = len(actuators)
         self._speeds = self.DeclareVectorInputPort("motor_speeds", 3)
         self._angle = self.DeclareVectorInputPort("steering_angle", 1)
@@ -68,7 +64,7 @@ class Motors(LeafSystem):
             "machine_state", plant.num_multibody_states(machine.instance)
         )
         self._net_actuation = self.DeclareVectorInputPort("net_actuation", n)
-        state = self.DeclareDiscreteState(np.zeros(len(self._functions)))
+        state = self.DeclareDiscreteState(np.zeros(2 * n))
         self.DeclarePeriodicDiscreteUpdateEvent(plant.time_step(), 0.0, self._update)
         # Not of the net actuation, which follows from these; nor of time, so that a step is solved once.
         commands = self.DeclareCacheEntry(
@@ -85,17 +81,21 @@ class Motors(LeafSystem):
         self.DeclareVectorOutputPort(
             "applied_generalized_force", plant.num_velocities(), self._calc_generalized_force, sources
         )
-        self.DeclareVectorOutputPort("bias", n, self._calc_bias, sources)
+        self.DeclareVectorOutputPort(
+            "motor_torques", n, self._calc_motor_torques, sources | {self._net_actuation.ticket()}
+        )
 
     def _calc_commands(self, context: Context, value: Value) -> None:
         speeds, state = self._speeds.Eval(context), self._machine_state.Eval(context)
-        torques = dict(zip(self._functions, context.get_discrete_state_vector().value(), strict=True))
+        before = context.get_discrete_state_vector().value().reshape(2, -1).T
         value.set_value(
             [
                 MotorCommand(0.0, 0.0, 0.0)
                 if motor is None
                 else motor.calc_command(
-                    float(speeds[self._sources[k]]), float(state[self._rates[k]]), float(torques.get(k, 0.0))
+                    float(speeds[self._sources[k]]),
+                    float(state[self._rates[k]]),
+                    MotorState(*map(float, before[k])),
                 )
                 for k, motor in enumerate(self._motors)
             ]
@@ -118,12 +118,13 @@ class Motors(LeafSystem):
         force[self._starts] = [command.bias for command in self._get_commands(context)]
         output.SetFromVector(force)
 
-    def _calc_bias(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([command.bias for command in self._get_commands(context)])
+    def _calc_motor_torques(self, context: Context, output: BasicVector) -> None:
+        bias = [command.bias for command in self._get_commands(context)]
+        output.SetFromVector(self._net_actuation.Eval(context) + bias)
 
     def _update(self, context: Context, values: DiscreteValues) -> None:
-        net, commands = self._net_actuation.Eval(context), self._get_commands(context)
-        values.set_value([net[k] + commands[k].bias for k in self._functions])
+        torques = self.GetOutputPort("motor_torques").Eval(context)
+        values.set_value(np.concatenate([torques, self._machine_state.Eval(context)[self._rates]]))
 
 
 def add_motors(builder: DiagramBuilder, plant: MultibodyPlant, machine: Machine) -> Motors:
@@ -152,16 +153,3 @@ def add_motors(builder: DiagramBuilder, plant: MultibodyPlant, machine: Machine)
     ):
         builder.Connect(motors.GetOutputPort(name), port)
     return motors
-
-
-def calc_motor_torques(machine: Machine, joint: str, net: Array, bias: Array, rate: Array) -> Array:
-    """Return a motor's torques [N m] over steps.
-
-    Args:
-        machine: the machine.
-        joint: its actuated joint.
-        net, bias: (k,) its net actuation and bias [N m].
-        rate: (k,) its joint's rate at the steps' ends [rad/s].
-    """
-    drag = machine.wheel.drag if joint in names.WHEEL_JOINTS else 0.0
-    return net + bias - drag * rate

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
 from drakerock.lhd.measurement import MEASUREMENT
-from drakerock.lhd.motors import calc_motor_torques
 from drakerock.lhd.names import WHEEL_JOINTS
 from drakerock.lhd.wall_contact import WALL_CONTACT
 from drakerock.loading.station import Station
@@ -17,9 +16,6 @@ Array = NDArray[np.float64]
 
 FORCE_NAMES = ("bucket_torque_x", "bucket_torque_y", "bucket_torque_z",
                "bucket_force_x", "bucket_force_y", "bucket_force_z")  # fmt: skip
-
-
-TORQUE_PARTS = ("net_actuation", "motor_bias")
 
 
 def calc_signals(station: Station, root_context: Context) -> tuple[dict[str, Array], dict[str, str]]:
@@ -59,25 +55,17 @@ def calc_signals(station: Station, root_context: Context) -> tuple[dict[str, Arr
     n_q = plant.num_positions(instance)
     full = np.arange(plant.num_velocities(), dtype=float)
     row_of_velocity = {int(v): k for k, v in enumerate(plant.GetVelocitiesFromArray(instance, full))}
-    # Net actuation is ordered as the instance's actuators.
+    # Torques are ordered as the instance's actuators.
     joints = [plant.get_joint_actuator(k).joint() for k in plant.GetJointActuatorIndices(instance)]
     row_of_torque = {joint.name(): k for k, joint in enumerate(joints)}
     row_of_rate = {joint.name(): row_of_velocity[joint.velocity_start()] for joint in joints}
     groups = {"wheels": WHEEL_JOINTS, "boom": ("boom_joint",), "bucket": ("bucket_joint",)}
-    net, bias = (data[key] for key in TORQUE_PARTS)
     step = station.scenario.dynamics.time_step
     total = np.zeros_like(time)
     for name, members in groups.items():
         rate = data["machine_state"][n_q:][[row_of_rate[joint] for joint in members]]
         following = np.concatenate([rate[:, 1:], rate[:, -1:]], axis=1)
-        torque = np.array(
-            [
-                calc_motor_torques(
-                    station.machine, joint, net[row_of_torque[joint]], bias[row_of_torque[joint]], after
-                )
-                for joint, after in zip(members, following, strict=True)
-            ]
-        )
+        torque = data["motor_torques"][[row_of_torque[joint] for joint in members]]
         columns[f"torque_{name}"], units[f"torque_{name}"] = torque.sum(axis=0), "N m"
         power = (torque * 0.5 * (rate + following)).sum(axis=0)
         columns[f"power_{name}"], units[f"power_{name}"] = power, "W"

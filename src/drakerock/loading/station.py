@@ -237,8 +237,7 @@ def make_station(
 
     signals |= {
         "motor_speeds": motor_speeds,
-        "net_actuation": plant.get_net_actuation_output_port(machine.instance),
-        "motor_bias": motors.GetOutputPort("bias"),
+        "motor_torques": motors.GetOutputPort("motor_torques"),
         "wall_contact": walls.GetOutputPort("wall_contact"),
     }
     logs = {}
@@ -270,8 +269,8 @@ def make_station(
 
 
 LOGGED = (
-    "measurement", "motor_speeds", "mode", "net_actuation", "motor_bias", "machine_state", "hinge_moment",
-    "bucket_force", "rock_summary", "wall_contact",
+    "measurement", "motor_speeds", "mode", "motor_torques", "machine_state", "hinge_moment", "bucket_force",
+    "rock_summary", "wall_contact",
 )  # fmt: skip
 """Signals that are logged in every step."""
 EXPORTED = ("measurement", "plan", "height_field", "mode", "progress", "motor_speeds", "pile", "bucket_force")

@@ -294,6 +294,8 @@ class Writer:
         """Add a joint; without gains it has no actuator."""
         text = f"<lower>{limits[0]:.9f}</lower><upper>{limits[1]:.9f}</upper>" if limits else ""
         if motor:
+            if "stop_deg" in motor:
+                text += f"<upper>{math.radians(motor['stop_deg']):.9f}</upper>"
             text += f"<effort>{motor['effort']:g}</effort><velocity>{motor['velocity']:g}</velocity>"
         elif gains is None:
             text += "<effort>0</effort>"

@@ -12,7 +12,18 @@ import re
 
 import yaml
 
-_NONE = ("colors", "lugs", "limit_deg", "friction", "dissipation", "color", "mirror", "collision", "axis")
+_NONE = (
+    "colors",
+    "lugs",
+    "limit_deg",
+    "stop_deg",
+    "friction",
+    "dissipation",
+    "color",
+    "mirror",
+    "collision",
+    "axis",
+)
 
 # By the last keys of a number's place in the design; the first that fits counts.
 _EXPONENTS: tuple[tuple[tuple[str, ...], int], ...] = (

@@ -3,19 +3,22 @@
 The joint is stepped here by the law as `motor_law` states it, piece by piece, without Drake.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drakerock.lhd.motor_law import DEADBAND, Motor
+from drakerock.lhd.motor_law import DEADBAND, Motor, MotorState
 
 STEP = 0.01
 INERTIA = 1e5  # of a loaded boom about its hinge [kg m^2]
 FUNCTION = Motor(2e6, 1.0, 1e8, holds=True, check_valve=True, relief=2.2e6)
 COMPLIANT = Motor(2e6, 1.0, 1e8)
-LINEAR = Motor(190e3, 1.3, 1e8, curve=((0.0, 190e3), (1.56, 0.0)))
-KNEE = Motor(190e3, 1.3, 1e8, curve=((0.0, 190e3), (0.5, 190e3), (1.0, 95e3), (1.5, 0.0)))
+WHEEL = 950.0  # a wheel alone about its axle [kg m^2]
+LINEAR = Motor(190e3, 1.3, 1e8, curve=((0.0, 190e3), (1.56, 0.0)), inertia=WHEEL)
+KNEE = Motor(190e3, 1.3, 1e8, curve=((0.0, 190e3), (0.5, 190e3), (1.0, 95e3), (1.5, 0.0)), inertia=WHEEL)
 
 
 def step(motor, command, load, inertia, rate):
@@ -23,22 +26,27 @@ def step(motor, command, load, inertia, rate):
     offset = command.bias + load
     for fixed, slope in (
         (motor.damping * command.rate + command.feedforward, motor.damping),
-        (motor.peak, 0.0),
-        (-motor.peak, 0.0),
+        (motor.half_window, 0.0),
+        (-motor.half_window, 0.0),
     ):
-        end = (inertia * rate + STEP * (fixed + offset)) / (inertia + STEP * (slope + motor.drag))
+        end = (inertia * rate + STEP * (fixed + offset)) / (inertia + STEP * slope)
         acting = motor.damping * (command.rate - end) + command.feedforward
-        if abs(np.clip(acting, -motor.peak, motor.peak) - (fixed - slope * end)) <= 1e-6 * motor.peak:
-            return end, fixed - slope * end + command.bias - motor.drag * end
+        if (
+            abs(np.clip(acting, -motor.half_window, motor.half_window) - (fixed - slope * end))
+            <= 1e-6 * motor.peak
+        ):
+            return end, fixed - slope * end + command.bias
     raise AssertionError("no piece of the law fits")
 
 
-def run(motor, wanted, load, duration, inertia=INERTIA, rate=0.0, torque=0.0):
+def run(motor, wanted, load, duration, inertia=INERTIA, rate=0.0):
     """Step a joint under a load [N m]; wanted and load are functions of time. Return rates, torques, angles."""
-    rows, angle = [], 0.0
+    rows, angle, before = [], 0.0, MotorState(0.0, rate)
     for k in range(round(duration / STEP)):
-        command = motor.calc_command(wanted(k * STEP), rate, torque)
-        rate, torque = step(motor, command, load(k * STEP), inertia, rate)
+        command = motor.calc_command(wanted(k * STEP), rate, before)
+        start = rate
+        rate, torque = step(motor, command, load(k * STEP), inertia, start)
+        before = MotorState(torque, start)
         angle += STEP * rate
         rows.append((rate, torque, angle))
     return np.array(rows).T
@@ -134,7 +142,7 @@ def test_stall_and_no_load():
     rates, torques, _ = run(LINEAR, lambda _: 1.3, lambda _: 0.0, 2.0, inertia=1e3)
     assert rates[-1] == pytest.approx(1.3)
     assert torques[-1] == pytest.approx(0.0, abs=1.0)
-    fast = Motor(190e3, 3.0, 1e8, curve=LINEAR.curve)
+    fast = replace(LINEAR, velocity=3.0)
     rates, torques, _ = run(fast, lambda _: 3.0, lambda _: 0.0, 5.0, inertia=1e3)
     assert rates[-1] == pytest.approx(1.56, rel=1e-6)
     assert torques[-1] == pytest.approx(0.0, abs=1.0)
@@ -142,30 +150,43 @@ def test_stall_and_no_load():
 
 @pytest.mark.parametrize("motor", [LINEAR, KNEE])
 @pytest.mark.parametrize("load", [-150e3, -60e3])
-@pytest.mark.parametrize("inertia", [1e3, 5e4])
+@pytest.mark.parametrize("inertia", [WHEEL, 2.5e3, 5e4])
 def test_loaded_wheel_settles_on_its_curve(motor, load, inertia):
     """Light wheels, which an explicit curve would make swing, and heavy ones."""
-    fast = Motor(190e3, 3.0, 1e8, curve=motor.curve)
+    fast = replace(motor, velocity=3.0)
     rates, torques, _ = run(fast, lambda _: 3.0, lambda _: load, 6.0, inertia=inertia)
     assert rates[-1] == pytest.approx(motor.find_rate(-load), rel=1e-3)
     assert motor.calc_limit(motor.find_rate(-load)) == pytest.approx(-load)
-    assert np.diff(rates).min() > -1e-9, "it runs up without swinging"
-    assert (torques <= 190e3 + 1e-6).all()
+    assert rates.max() < motor.find_rate(-load) + 0.06, "it does not swing about its curve"
+    assert np.ptp(torques[-100:]) < 1.0
+    assert torques.max() <= 190e3 * (1.0 + 1e-9)
+
+
+@given(
+    loads=st.lists(st.floats(-2e5, 1e5), min_size=10, max_size=20),
+    inertia=st.floats(WHEEL, 5e4),
+    motor=st.sampled_from([LINEAR, KNEE]),
+)
+def test_no_blow_drives_a_wheel_above_its_stall_torque(loads, inertia, motor):
+    _, torques, _ = run(
+        motor, lambda _: 1.3, lambda t: loads[round(t / STEP)], STEP * len(loads), inertia=inertia
+    )
+    assert torques.max() <= 190e3 * (1.0 + 1e-9)
 
 
 def test_run_up_follows_the_exponential_of_a_linear_curve():
+    """A heavy wheel, whose load the first steps do not know: its torque comes up with a lag of two steps."""
     rates, _, _ = run(LINEAR, lambda _: 1.3, lambda _: 0.0, 0.6, inertia=5e4)
     time = STEP * np.arange(1, 61)
-    expected = 1.56 * (1.0 - np.exp(-time * LINEAR.drag / 5e4))
+    expected = 1.56 * (1.0 - np.exp(-time * 190e3 / 1.56 / 5e4))
     below = expected < 1.25
-    assert rates[below] == pytest.approx(expected[below], rel=0.02, abs=5e-3)
+    assert rates[below] == pytest.approx(expected[below], abs=2 * STEP * 190e3 / 5e4)
 
 
 def test_wheel_brakes_with_its_whole_torque():
     rates, torques, _ = run(LINEAR, lambda _: 0.0, lambda _: 0.0, 0.3, inertia=5e4, rate=1.3)
-    # But for the drag over the step, which a brake does not have.
-    assert torques[:20] == pytest.approx(-190e3, rel=0.03)
-    assert np.diff(rates[:20]) == pytest.approx(-190e3 / 5e4 * STEP, rel=0.03)
+    assert torques[:20] == pytest.approx(-190e3)
+    assert np.diff(rates[:20]) == pytest.approx(-190e3 / 5e4 * STEP)
 
 
 def test_a_curve_that_no_load_reaches():

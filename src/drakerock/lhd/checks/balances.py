@@ -11,9 +11,6 @@ from drakerock.lhd.checks.trials import Trials, place
 
 Array = np.ndarray
 
-# What the drag along the curve adds where a wheel changes its speed within a step and its curve is flat.
-DRAG_SHARE = 0.03
-
 
 def check_free_flight(trials: Trials) -> list[CheckRow]:
     """Let the machine float while its motors work; and fall, for gravity's impulse."""
@@ -83,9 +80,6 @@ def _calc_work(bench: Bench, record: Record) -> tuple[float, float]:
         torque = np.zeros_like(rate)
         if joint.name() in names.JOINTS:
             torque = record.effort[:, bench.get_column(joint.name())]
-        if joint.name() in names.WHEEL_JOINTS:
-            # That part is the motor's.
-            damping -= bench.machine.wheel.drag
         torque = torque - damping * rate
         power = torque * (rate + np.concatenate([[0.0], rate[:-1]])) / 2
         work += float(power.sum() * plant.time_step())
@@ -117,7 +111,7 @@ def check_records(trials: Trials) -> list[CheckRow]:
         )
         limits = trials.records[0][0].machine
         motor = {"wheels": limits.wheel, "boom": limits.boom, "bucket": limits.bucket}[name]
-        allowed = 1.0 + (DRAG_SHARE if motor.drag > 0.0 else 1e-9)
-        rows.append(bound(f"torque of {name}, all runs", torque / 1e3, "kNm", motor.peak / 1e3 * allowed))
+        limit = motor.peak * (1.0 + 1e-9)
+        rows.append(bound(f"torque of {name}, all runs", torque / 1e3, "kNm", limit / 1e3))
     walls = [float(record.wall[-1]) for _, record in trials.records]
     return [*rows, CheckRow("wall time of a step, the machine alone", 1e3 * float(np.median(walls)), "ms")]

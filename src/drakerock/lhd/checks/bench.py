@@ -33,7 +33,7 @@ from drakerock.lhd.hinge import HingeMoment, add_hinge_moment
 from drakerock.lhd.kinematics import Kinematics, make_kinematics
 from drakerock.lhd.linkage import Linkage
 from drakerock.lhd.model import Machine, add_machine
-from drakerock.lhd.motors import Motors, add_motors, calc_motor_torques
+from drakerock.lhd.motors import Motors, add_motors
 
 Array = np.ndarray
 
@@ -122,8 +122,8 @@ class Bench:
             begin = perf_counter()
             try:
                 # What acts over the step is told at its beginning.
-                net = plant.get_net_actuation_output_port(machine.instance).Eval(context).copy()
-                bias = self.motors.GetOutputPort("bias").Eval(motors_context).copy()
+                torques = self.motors.GetOutputPort("motor_torques").Eval(motors_context).copy()
+                columns["effort"].append(torques)
                 columns["moment"].append(self.hinge.GetOutputPort("components").Eval(hinge_context).copy())
                 columns["tyre_force"].append(self._calc_contact_forces(names.WHEELS))
                 columns["bucket_force"].append(self._calc_contact_forces(("bucket",))[0])
@@ -134,25 +134,10 @@ class Bench:
             columns["time"].append(root.get_time())
             columns["q"].append(plant.GetPositions(context, machine.instance))
             columns["v"].append(plant.GetVelocities(context, machine.instance))
-            columns["effort"].append(self._calc_torques(net, bias))
             columns["gap"].append(np.linalg.norm(self.linkage.calc_gap(), axis=1).max(initial=0.0))
             columns["tip"].append(tip.CalcPoseInWorld(context).translation())
             columns["wall"].append(wall / k)
         return Record(**{key: np.array(values) for key, values in columns.items()})
-
-    def _calc_torques(self, net: Array, bias: Array) -> Array:
-        """Return the torques (actuators,) over the step that ended, from its net actuation and biases."""
-        joints = [
-            self.plant.get_joint_actuator(k).joint()
-            for k in self.plant.GetJointActuatorIndices(self.machine.instance)
-        ]
-        rates = self.plant.GetVelocities(self.plant_context)[[joint.velocity_start() for joint in joints]]
-        return np.array(
-            [
-                calc_motor_torques(self.machine, joint.name(), net[k], bias[k], rates[k])
-                for k, joint in enumerate(joints)
-            ]
-        )
 
     def get_column(self, joint: str) -> int:
         """Return the column of an actuator in `Record.effort`."""
