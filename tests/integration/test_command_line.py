@@ -88,8 +88,8 @@ def test_signals_have_units_and_obey_the_limits(place, loaded):
     assert np.all(np.isfinite(np.column_stack(list(columns.values()))))
     assert np.allclose(np.diff(columns["time"]), 0.01)
     assert np.abs(columns["torque_wheels"]).max() <= 4 * 190e3 * (1 + 1e-9)
-    assert np.abs(columns["torque_boom"]).max() <= 2000e3 * (1 + 1e-9)
-    assert np.abs(columns["torque_bucket"]).max() <= 800e3 * (1 + 1e-9)
+    assert np.abs(columns["torque_boom"]).max() <= 1.07 * 2000e3 * (1 + 1e-9)  # the relief
+    assert np.abs(columns["torque_bucket"]).max() <= 1.07 * 800e3 * (1 + 1e-9)
     # Nothing is prescribed: before the rocks the machine is at the planned speed, by its wheels' grip.
     free = (columns["mode"] == 0) & (columns["time"] > 0.6)
     assert np.allclose(columns["v_F"][free], 1.3, atol=0.05)

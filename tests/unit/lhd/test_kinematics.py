@@ -150,12 +150,14 @@ def test_heights_out_of_reach_are_nan(kin):
 @fast
 @given(share, st.booleans())
 def test_tabulated_range_ends_at_a_stop(model, kin, boom, tilted):
-    """Just inside the range no stop is touched, just outside one is: the table errs by less than 2 mrad."""
+    """Just inside the range no stop is touched, just outside one is: the table errs by less than 2 mrad, 4 where two stops meet."""
     diagram, plant, _, machine = model
     root = diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
     phi_l, edge = pick(kin, 0.002 + 0.996 * boom, 0.0 if tilted else 1.0)
-    inwards = 2e-3 if tilted else -2e-3
+    inwards = (
+        2e-3 if tilted else -4e-3
+    )  # dumped it meets the cylinder's stop, or the bucket's with the boom up
     set_machine_angles(plant, context, machine, phi_l=phi_l, phi_b=edge + inwards, kin=kin)
     linkage = Linkage(plant, context, machine.instance, machine.loops)
     assert linkage.move(0.0, phi_l, edge + inwards)
@@ -170,7 +172,7 @@ def test_workspace_is_a_loaders(kin):
     assert tilt.min() > 33
     assert tilt.max() < 60
     dump = calc_pitch(kin, kin.phi_l_range[0], calc_bucket_range(kin, kin.phi_l_range[0])[1])
-    assert np.degrees(dump) == pytest.approx(-40, abs=2)
+    assert np.degrees(dump) == pytest.approx(-38, abs=2)
     floor_l, floor_b = calc_joint_angles(kin, 0.0, 0.0)
     low, high = calc_bucket_range(kin, floor_l)
     assert kin.phi_l_range[0] < floor_l < kin.phi_l_range[1]
