@@ -164,7 +164,10 @@ def test_stops_hold_the_motors():
         record = bench.run(1.3 * (high - low), bucket=sign)
         boom, bucket = bench.get_positions()
         edge = calc_bucket_range(kin, boom)[0 if sign < 0 else 1]
-        assert abs(record.effort[-1, bench.get_column("bucket_joint")]) == pytest.approx(8e5)
+        # The pump's torque, or what the check valve has trapped of the blow, up to the relief.
+        assert (
+            8e5 * (1 - 1e-6) <= abs(record.effort[-1, bench.get_column("bucket_joint")]) <= 1.07 * 8e5 + 1.0
+        )
         assert bucket == pytest.approx(float(edge), abs=0.01)
         assert record.gap.max() < 1e-3
 

@@ -150,7 +150,10 @@ def test_heights_out_of_reach_are_nan(kin):
 @fast
 @given(share, st.booleans())
 def test_tabulated_range_ends_at_a_stop(model, kin, boom, tilted):
-    """Just inside the range no stop is touched, just outside one is: the table errs by less than 2 mrad, 4 where two stops meet."""
+    """Just inside the range no stop is touched, just outside one is.
+
+    The table errs by less than 2 mrad, 4 where two stops meet.
+    """
     diagram, plant, _, machine = model
     root = diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
