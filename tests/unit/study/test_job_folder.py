@@ -17,7 +17,9 @@ def test_used_folder_is_refused_and_force_removes_what_a_loading_wrote(tmp_path)
     mine = tmp_path / "notes.txt"
     for path in (mine, tmp_path / "outcome.json", tmp_path / "figure_side.png", tmp_path / "replay.html"):
         path.write_text("x")
-    with pytest.raises(InputError, match=r"an earlier loading is there \(outcome.json\); take another folder, or force"):
+    with pytest.raises(
+        InputError, match=r"an earlier loading is there \(outcome.json\); take another folder, or force"
+    ):
         enter(tmp_path)
     assert len(list(tmp_path.iterdir())) == 4
     with use_folder(tmp_path, force=True, sequence=False):
