@@ -184,8 +184,7 @@ def load(
     from drakerock.study.job_folder import use_folder
     from drakerock.study.jobs import run_and_save, run_and_save_sequence
 
-    strategy = {"alpha": alpha, "beta": beta, "gamma": gamma, "kappa": kappa}
-    overrides = [f"loading.strategy.{key}={value}" for key, value in strategy.items() if value is not None]
+    overrides = _name_strategy(alpha=alpha, beta=beta, gamma=gamma, kappa=kappa)
     if plan is not None:
         overrides.append(f"loading.planning.source={json.dumps(str(plan))}")
     config = _load(scenario, seed, [*(set_ or []), *overrides])
@@ -579,10 +578,7 @@ def study_confirm(
     from drakerock.study.analysis import format_confirmation, run_confirm, run_report
     from drakerock.study.resimulation import Resimulation
 
-    def say(text: str) -> None:
-        terminal.print_line(text, terminal.get_console())
-
-    again = Resimulation(folder, workers=workers, scheduler=scheduler, say=say)
+    again = Resimulation(folder, workers=workers, scheduler=scheduler, say=terminal.say)
     with terminal.show_progress("confirm") as advance:
         confirmation = run_confirm(folder, again.evaluate, points, again.run, advance)
         report = run_report(folder, None, advance)[0]
@@ -615,20 +611,17 @@ def calibrate(
     from drakerock.study.display import Display
     from drakerock.study.schema import load_study
 
-    def say(text: str) -> None:
-        terminal.print_line(text, terminal.get_console())
-
     config = load_study(study, set_ or ())
     with Display(terminal.get_console()) as display:
         result, paths = run_calibration(
-            config, measured, out, workers=workers, scheduler=scheduler, display=display, say=say
+            config, measured, out, workers=workers, scheduler=scheduler, display=display, say=terminal.say
         )
     if json_:
         print(json.dumps(result))
         return
     terminal.print_calibration(result)
     for warning in result["warnings"]:
-        say(f"warning: {warning}")
+        terminal.say(f"warning: {warning}")
     terminal.print_paths(paths)
 
 
@@ -694,8 +687,7 @@ def plan(
     """
     from drakerock.study.preview import Preview
 
-    strategy = {"alpha": alpha, "beta": beta, "gamma": gamma, "kappa": kappa}
-    overrides = [f"loading.strategy.{key}={value}" for key, value in strategy.items() if value is not None]
+    overrides = _name_strategy(alpha=alpha, beta=beta, gamma=gamma, kappa=kappa)
     config = _load(scenario, None, [*(set_ or []), *overrides])
     with terminal.show_progress("plan"):
         preview = Preview(config, pile, study)
@@ -748,6 +740,11 @@ def _start_meshcat() -> Any:
         raise InputError(f"--meshcat: no server can be started: {error}") from None
     terminal.get_output().print(f"live view: {meshcat.web_url()}")
     return meshcat
+
+
+def _name_strategy(**values: float | None) -> list[str]:
+    """Return what was given of a strategy as overrides of a scenario."""
+    return [f"loading.strategy.{key}={value}" for key, value in values.items() if value is not None]
 
 
 def _load(path: Path | None, seed: int | None, overrides: list[str] | None) -> Any:

@@ -40,6 +40,11 @@ def print_line(text: str, console: Console | None = None) -> None:
     (console or get_output()).print(Text(text), soft_wrap=True)
 
 
+def say(text: str) -> None:
+    """Print a line on standard error."""
+    print_line(text, get_console())
+
+
 def print_error(word: str, error: Exception) -> None:
     """Print an error after a word in red."""
     from rich.text import Text

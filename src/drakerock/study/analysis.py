@@ -238,7 +238,7 @@ def _load(source: Path) -> tuple[ResponseTable, ExplorationConfig, int]:
     except OSError as error:  # a name too long, a folder that may not be entered
         raise InputError(f"{source}: cannot be read: {error.strerror}") from None
     if stored:
-        export_tables(source, ["parquet"])
+        export_tables(source, ["parquet"], fields=False)
     table = ResponseTable.load(source)
     path = _find_folder(source) / "study.json"
     try:

@@ -163,10 +163,13 @@ def read_height_fields(store: Store) -> pa.Table:
     return pa.Table.from_pylist(rows)
 
 
-def export_tables(folder: str | Path, formats: Sequence[str] = ("csv", "parquet")) -> list[Path]:
+def export_tables(
+    folder: str | Path, formats: Sequence[str] = ("csv", "parquet"), *, fields: bool = True
+) -> list[Path]:
     """Write `responses` (a row per finished point) and `loadings` (a row per cycle); return the paths.
 
-    As Parquet also `height_fields` (a row per loading that has them).
+    As Parquet also `height_fields` (a row per loading that has them), unless `fields` is false: each loading has a file
+    of them to be read.
 
     Raises:
         InputError: no store there; not one of the formats csv and parquet; the folder cannot be written.
@@ -174,14 +177,14 @@ def export_tables(folder: str | Path, formats: Sequence[str] = ("csv", "parquet"
     with Store.open(folder) as store:
         responses = read_responses(store)
         tables = {"loadings": read_loadings(store)}
-        if "parquet" in formats:
+        if fields and "parquet" in formats:
             tables["height_fields"] = read_height_fields(store)
     paths = []
     for suffix in formats:
         if suffix not in ("csv", "parquet"):
             raise InputError(f"format {suffix}: csv or parquet")
         for name in ("responses", "loadings", "height_fields"):
-            if name == "height_fields" and (suffix == "csv" or not len(tables[name])):
+            if name == "height_fields" and (suffix == "csv" or not len(tables.get(name, ()))):
                 continue
             path = Path(folder) / f"{name}.{suffix}"
             partial = path.with_name(f".partial-{path.name}")

@@ -70,12 +70,10 @@ class RockStates:
         # Should the step fail, its room is lost.
         other, self._states = [state for state in self._states if state is not now], (now,)
         room = other[0].room if other else None
-        if room is None:
-            room = self._engine.make_room()
-            self._engine.copy_to(now.arrays, room)
-        elif now.report is not None and other[0].arrays.steps == number - 1:
+        if room is not None and now.report is not None and other[0].arrays.steps == number - 1:
             self._engine.write_changes(now.arrays, now.report, room)
         else:
+            room = self._engine.make_room() if room is None else room
             self._engine.copy_to(now.arrays, room)
         arrays, report = self._engine.step(now.arrays, machine, room)
         following = SolvedState(arrays, report, room)
