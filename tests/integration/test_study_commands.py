@@ -134,7 +134,7 @@ def test_schema_describes_the_shipped_studies(run):
     schema = json.loads(out)
     assert code == 0
     jsonschema.Draft202012Validator.check_schema(schema)
-    for name in ("smoke", "reduced", "paper", "control_parameters"):
+    for name in ("smoke", "reduced", "full_size", "paper", "control_parameters"):
         jsonschema.validate(read_shipped(name), schema)
     jsonschema.validate({"executor": {"memory_limit": 0, "slurm": {"account": 17}}}, schema)
     for wrong in ({"laodings": 3}, {"loadings": True}, {"scenario": {"seed": -1}}):
