@@ -104,7 +104,7 @@ def test_controller_and_machine_parameters_act_on_a_real_study(tmp_path):
         assert outcome["scenario_hash"] == calc_config_hash(scenario)
 
 
-@pytest.mark.parametrize("name", ["smoke", "reduced", "paper", "control_parameters"])
+@pytest.mark.parametrize("name", ["smoke", "reduced", "full_size", "paper", "control_parameters"])
 def test_shipped_studies_can_be_read(name):
     study = load_study(find_data("studies", f"{name}.yaml"))
     sampling = study.exploration.sampling
