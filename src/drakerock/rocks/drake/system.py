@@ -86,6 +86,7 @@ class NonsmoothRocks(RockSystem):
         super().__init__(plant, pile, shapes, geometry.bodies)
         self._engine = engine
         self._provenance = dict(pile.provenance)
+        self._default_state = SolvedState(engine.make_arrays(pile))
         self._states = self.DeclareAbstractState(Value[object](self._make_states(pile)))
         # The state's number, and what the step that led to it told.
         self._number = self.DeclareDiscreteState(1)
@@ -161,6 +162,8 @@ class NonsmoothRocks(RockSystem):
         return report
 
     def _make_states(self, pile: PileState) -> RockStates:
+        if pile is self._default_pile:
+            return RockStates(self._engine, self._default_state)
         return RockStates(self._engine, SolvedState(self._engine.make_arrays(pile)))
 
     def _get_states(self, context: Context) -> tuple[RockStates, int]:
