@@ -109,5 +109,8 @@ def test_shipped_studies_can_be_read(name):
     study = load_study(find_data("studies", f"{name}.yaml"))
     sampling = study.exploration.sampling
     n_cycles = (sampling.n_samples + sampling.n_validation) * study.loadings
-    assert n_cycles == {"smoke": 10, "reduced": 760, "full_size": 1560, "paper": 4880, "control_parameters": 290}[name]
+    assert (
+        n_cycles
+        == {"smoke": 10, "reduced": 760, "full_size": 1560, "paper": 4880, "control_parameters": 290}[name]
+    )
     assert find_data("studies", f"{name}.py").exists()
