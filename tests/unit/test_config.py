@@ -7,7 +7,7 @@ from drakerock.errors import InputError
 from drakerock.identity import calc_config_hash
 from drakerock.loading.config import StrategyConfig
 from drakerock.loading.scenario import Scenario, load_scenario
-from drakerock.study.schema import StudyConfig
+from drakerock.study.schema import StudyConfig, load_study
 
 
 def test_empty_text_means_all_defaults():
@@ -143,3 +143,16 @@ def test_changing_is_checked_like_reading():
     assert StrategyConfig(alpha=1.3).model_copy() == StrategyConfig(alpha=1.3)
     with pytest.raises(InputError, match="alpha"):
         StrategyConfig().model_copy(update={"alpha": -3})
+
+
+def test_shipped_studies_are_found_from_anywhere_and_a_file_that_is_there_comes_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert load_scenario("studies/small.yaml").pile.rocks == 300
+    assert load_study("studies/sensitivity.yaml").scenario.pile.rocks == 300
+    with pytest.raises(
+        InputError, match=r"studies/nothing.yaml: cannot be read|studies/nothing.yaml: no such"
+    ):
+        load_scenario("studies/nothing.yaml")
+    (tmp_path / "studies").mkdir()
+    (tmp_path / "studies" / "small.yaml").write_text("pile: {rocks: 7}")
+    assert load_scenario("studies/small.yaml").pile.rocks == 7
