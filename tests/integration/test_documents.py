@@ -70,7 +70,10 @@ TINY = [
 ]
 # What long commands are given besides.
 SHORTER = {
-    "lab": ["--with", "rocks=60", "--repeats", "1"],
+    "lab": [
+        *("--set", "rocks.gradation=[{size_m: 0.3, mass_fraction: 1.0}]"),
+        *("--with", "rocks=60", "--repeats", "1"),
+    ],
     "film": ["--fps", "1", "--speed", "4", "--size", "240x160"],
 }
 
