@@ -28,6 +28,7 @@ from drakerock.loading import scenario as scenario_module
 from drakerock.loading.scenario import Scenario
 from drakerock.rocks.surveying import files as cloud_files
 from drakerock.study import preview_server, schema
+from drakerock.study.calibration import run_calibration
 from drakerock.study.resimulation import Resimulation
 from drakerock.study.runner import run_study
 from drakerock.study.schema import StudyConfig, load_study
@@ -121,7 +122,7 @@ def place(tmp_path, monkeypatch):
     Path("align.yaml").write_text("unit: m\n")
     time = np.linspace(0.1, 5.9, 100)
     angle, force = calibration_work.calc_curves(2500.0, 1.0, time)
-    rows = np.column_stack([time, angle, -3.0 + 0.4 * time, force, np.full(len(time), 1e5)])
+    rows = np.column_stack([time, angle, -3.0 + 0.4 * time, force, 2.0 * force])
     Path("measured.csv").write_text(
         "t [s],boom angle [rad],tip [m],push force [N],boom torque [N m]\n"
         + "\n".join(",".join(f"{value:.6g}" for value in row) for row in rows)
@@ -148,6 +149,7 @@ def cheap(monkeypatch):
     monkeypatch.setattr(report, "save_figures", save_confirmation)
     for function in (run_study, Resimulation.__init__):
         monkeypatch.setitem(function.__kwdefaults__, "work", "study_work:run")
+    monkeypatch.setitem(run_calibration.__kwdefaults__, "work", "calibration_work:run")
     monkeypatch.setattr(preview_server, "serve_preview", lambda preview, say: say("http://nowhere"))
 
 
