@@ -25,7 +25,8 @@ def run(scenario, n_loadings, folder, *, progress=None):
     # As one pile differs from another.
     force = force * (1 + 0.02 * make_generator(scenario.seed, "scatter").normal())
     columns = {"time": time, "phi_l": angle, "bucket_force_x": force, "x_T": -3.0 + 0.4 * time}
-    units = {"time": "s", "phi_l": "rad", "bucket_force_x": "N", "x_T": "m"}
+    columns["torque_boom"] = 2.0 * force
+    units = {"time": "s", "phi_l": "rad", "bucket_force_x": "N", "x_T": "m", "torque_boom": "N m"}
     for number in range(n_loadings):
         save_signals(columns, units, folder / f"loading_{number:02d}" / "signals.parquet")
     return outcomes

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, fie
 
 from drakerock.errors import InputError
 from drakerock.files import read_text
+from drakerock.resources import find_study_file
 from drakerock.yaml_reader import Key, YamlDocument
 
 
@@ -84,15 +85,16 @@ def load_config[ConfigT: Config](
     """Read a YAML file into `schema`. A file that it names is looked for beside it first, then from where one works.
 
     Args:
-        path: the YAML file; an empty file means all defaults.
+        path: the YAML file; an empty file means all defaults. ``studies/...``, if not there, is the shipped one.
         overrides: ``"dotted.key=value"`` strings, the value in YAML, applied on top of the file.
         complete: may alter the data before they are checked, such as by what another file holds.
 
     Raises:
         InputError: unreadable file, YAML syntax, unknown key, value out of range.
     """
-    text, folder = read_text(Path(path)), Path(path).parent
-    return parse_config(text, schema, overrides, source=str(path), complete=complete, folder=folder)
+    path = find_study_file(Path(path))
+    text = read_text(path)
+    return parse_config(text, schema, overrides, source=str(path), complete=complete, folder=path.parent)
 
 
 def parse_config[ConfigT: Config](

@@ -21,6 +21,16 @@ def find_file(name: str) -> Path:
     return find_data("models", name.removeprefix(_PREFIX)) if name.startswith(_PREFIX) else Path(name)
 
 
+def find_study_file(path: Path) -> Path:
+    """Return `path`; if it is ``studies/...`` and not there, the shipped file of that name, if there is one."""
+    if path.parts[:1] != ("studies",) or path.exists():
+        return path
+    try:
+        return find_data(*path.parts)
+    except FileNotFoundError:
+        return path
+
+
 def find_data(*parts: str) -> Path:
     """Return the path of a shipped file or folder, such as ``find_data("models", "package.xml")``.
 

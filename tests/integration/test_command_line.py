@@ -259,17 +259,11 @@ def test_pile_command(place, run):
             ["load", "small.yaml", "--set", "machine.model=nothing.sdf"],
             ["machine.model", "nothing.sdf", "no such file"],
         ),
-        (["load", "small.yaml", "--set", "machine.model=broken.sdf"], ["critical_moment", "broken.sdf"]),
+        (["load", "small.yaml", "--set", "machine.model=broken.sdf"], ["broken.sdf:1", "no valid XML"]),
+        (["load", "small.yaml", "--set", "machine.model=empty.sdf"], ["empty.sdf:1", "no <inertial>"]),
         (
-            [
-                "load",
-                "small.yaml",
-                "--set",
-                "machine.model=broken.sdf",
-                "--set",
-                "loading.performance.tau_c=1e5",
-            ],
-            ["broken.sdf:1", "no valid XML"],
+            ["load", "small.yaml", "--set", "machine.model=package://drakerock/lhd_small/lhd_small.sdf"],
+            ["machine.expected.critical_moment", "lhd_small.sdf"],
         ),
         (["load", "small.yaml", "--set", "pile.source=nothing.npz"], ["nothing.npz", "no such file"]),
         (["load", "small.yaml", "--set", "pile.source=broken.npz"], ["broken.npz", "not a readable"]),
@@ -292,6 +286,7 @@ def test_bad_input_gets_one_message_and_exit_code_two(place, run, args, parts):
     (place / "bad.yaml").write_text("site:\n  drift_widht: 5\n")
     (place / "bad.json").write_text("{}")
     (place / "broken.sdf").write_text("<sdf><model>")
+    (place / "empty.sdf").write_text('<sdf version="1.9"><model name="m"><link name="a"/></model></sdf>')
     (place / "broken.npz").write_bytes(b"PK\x03\x04 broken")
     code, out, error = run(*args)
     assert code == 2, error + out

@@ -7,7 +7,7 @@ from drakerock.errors import InputError
 from drakerock.identity import calc_config_hash
 from drakerock.loading.config import StrategyConfig
 from drakerock.loading.scenario import Scenario, load_scenario
-from drakerock.study.schema import StudyConfig
+from drakerock.study.schema import StudyConfig, load_study
 
 
 def test_empty_text_means_all_defaults():
@@ -67,13 +67,10 @@ def test_missing_and_unreadable_file(tmp_path):
         load_config(tmp_path / "b.yaml", Scenario)
 
 
-def test_shipped_demo_is_valid():
-    assert load_scenario().loading.strategy.model_dump() == {
-        "alpha": 1.1,
-        "beta": 0.5,
-        "gamma": 0.5,
-        "kappa": 0.5,
-    }
+def test_shipped_demo_is_the_defaults_but_for_its_strategy():
+    demo, default = load_scenario(), Scenario()
+    assert demo.loading.strategy != default.loading.strategy
+    assert demo.replace(**{"loading.strategy": default.loading.strategy}) == default
 
 
 @given(alpha=st.floats(0.2, 2.0), seed=st.integers(0, 10**9))
@@ -143,3 +140,16 @@ def test_changing_is_checked_like_reading():
     assert StrategyConfig(alpha=1.3).model_copy() == StrategyConfig(alpha=1.3)
     with pytest.raises(InputError, match="alpha"):
         StrategyConfig().model_copy(update={"alpha": -3})
+
+
+def test_shipped_studies_are_found_from_anywhere_and_a_file_that_is_there_comes_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert load_scenario("studies/small.yaml").pile.rocks == 300
+    assert load_study("studies/sensitivity.yaml").scenario.pile.rocks == 300
+    with pytest.raises(
+        InputError, match=r"studies/nothing.yaml: cannot be read|studies/nothing.yaml: no such"
+    ):
+        load_scenario("studies/nothing.yaml")
+    (tmp_path / "studies").mkdir()
+    (tmp_path / "studies" / "small.yaml").write_text("pile: {rocks: 7}")
+    assert load_scenario("studies/small.yaml").pile.rocks == 7

@@ -18,7 +18,17 @@ from drakerock.lhd.geometry import calc_heaped_capacity
 from drakerock.loading.evaluation import make_outcome
 from drakerock.loading.field import HeightField
 from drakerock.loading.field_file import save_height_fields
-from drakerock.loading.folder import HEIGHT_FIELDS
+from drakerock.loading.folder import (
+    CYCLE_FILES,
+    HEIGHT_FIELDS,
+    OUTCOME,
+    PILE_AFTER,
+    PILE_BEFORE,
+    PLAN,
+    RECORDING,
+    SCENARIO,
+    SIGNALS,
+)
 from drakerock.loading.mining import MachineRating
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.performance import Weighing, find_bucket_load, find_debris, find_lost
@@ -287,8 +297,7 @@ def _make_notes(outcome: CycleOutcome) -> dict[str, object]:
 
 
 def save_cycle(result: CycleResult, folder: str | Path) -> list[Path]:
-    """Write a cycle's files: outcome.json, signals.parquet, plan.json, scenario.json, pile_before.npz,
-    pile_after.npz, recording.npz, height_fields.npz.
+    """Write a cycle's files, those of `CYCLE_FILES`.
 
     Returns:
         The paths written; outcome.json is the last, so that a folder with it is complete.
@@ -298,24 +307,14 @@ def save_cycle(result: CycleResult, folder: str | Path) -> list[Path]:
     """
     folder = Path(folder)
     make_folder(folder)
-    save_pile(result.pile_before, folder / "pile_before.npz")
-    save_pile(result.pile_after, folder / "pile_after.npz")
-    save_signals(result.signals, result.units, folder / "signals.parquet")
+    save_pile(result.pile_before, folder / PILE_BEFORE)
+    save_pile(result.pile_after, folder / PILE_AFTER)
+    save_signals(result.signals, result.units, folder / SIGNALS)
     if result.recording is not None:
-        save_recording(result.recording, folder / "recording.npz")
-    save_plan(result.plan, result.field, folder / "plan.json")
+        save_recording(result.recording, folder / RECORDING)
+    save_plan(result.plan, result.field, folder / PLAN)
     if result.field_after is not None:
         save_height_fields(result.field, result.field_after, folder / HEIGHT_FIELDS)
-    write_text(folder / "scenario.json", result.scenario.resolve().model_dump_json(indent=2) + "\n")
-    write_text(folder / "outcome.json", result.outcome.to_json())
-    names = [
-        "pile_before.npz",
-        "pile_after.npz",
-        "signals.parquet",
-        "recording.npz",
-        "plan.json",
-        HEIGHT_FIELDS,
-        "scenario.json",
-        "outcome.json",
-    ]
-    return [folder / name for name in names if (folder / name).exists()]
+    write_text(folder / SCENARIO, result.scenario.resolve().model_dump_json(indent=2) + "\n")
+    write_text(folder / OUTCOME, result.outcome.to_json())
+    return [folder / name for name in CYCLE_FILES if (folder / name).exists()]

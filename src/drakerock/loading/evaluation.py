@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drakerock.identity import calc_config_hash, get_versions
+from drakerock.loading.folder import PLAN, SIGNALS
 from drakerock.loading.mining import MachineRating, calc_mining_numbers
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.performance import Weighing, calc_damage, find_events, find_weighing_events
@@ -140,7 +141,7 @@ def make_outcome(
         sim_time_s=float(time[-1]) if len(time) else 0.0,
         steps=steps,
         ms_per_step=1e3 * cpu_time / max(steps, 1),
-        files={"planned_tip_path": "plan.json", "actual_tip_path": "signals.parquet"},
+        files={"planned_tip_path": PLAN, "actual_tip_path": SIGNALS},
         seed=scenario.seed,
         versions=get_versions(),
         scenario_hash=calc_config_hash(scenario),

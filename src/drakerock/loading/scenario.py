@@ -54,9 +54,12 @@ class Scenario(Config):
     @model_validator(mode="after")
     def _check_critical_moment(self) -> Scenario:
         if self.loading.performance.tau_c is None and self.machine.data.critical_moment is None:
-            model = self.machine.model
-            if "://" not in model and not Path(model).exists():
-                raise ValueError(f"machine.model: {model}: no such file")
+            # Of a machine that is nowhere, or no machine, that is what has to be said first.
+            from drakerock.lhd.model_file import (
+                check_machine_file,  # Drake: not for those who only read a scenario
+            )
+
+            check_machine_file(self.machine)
             raise ValueError(
                 f"machine.expected.critical_moment: what moment the bucket's hinge of {self.machine.model} may carry "
                 "is not known, and the damage measure needs it; give it here [N m], or as loading.performance.tau_c"

@@ -26,7 +26,7 @@ from drakerock.exploration.strategy import Strategy, choose_strategy, parse_weig
 from drakerock.exploration.surrogate import Surrogate, fit_surrogate
 from drakerock.exploration.table import ResponseTable
 from drakerock.exploration.validation import calc_learning_curve, validate
-from drakerock.exploration.verdict import Verdict, judge
+from drakerock.exploration.verdict import Grade, Verdict, judge
 from drakerock.files import read_json, write_text
 from drakerock.study.db import DATABASE
 from drakerock.study.replays import link_replays, write_study_replays
@@ -147,8 +147,14 @@ class Predictor:
 
 
 def _judge(surrogate: Surrogate, table: ResponseTable) -> Verdict:
-    curve = calc_learning_curve(surrogate, table)
-    return judge(validate(surrogate, table), table.role.count("sample"), *curve)
+    accuracy, n_points = validate(surrogate, table), table.role.count("sample")
+    verdict = judge(accuracy, n_points)
+    # Many refits, and only the advice of a study that falls short is made of them.
+    return (
+        verdict
+        if verdict.grade == Grade.GOOD
+        else judge(accuracy, n_points, *calc_learning_curve(surrogate, table))
+    )
 
 
 def run_confirm(

@@ -16,6 +16,7 @@ from drakerock.exploration.problem import Array
 from drakerock.exploration.sampling import make_initial_design
 from drakerock.files import make_folder, write_text
 from drakerock.lhd.measurement import MEASUREMENT
+from drakerock.loading.folder import PILE_BEFORE, SIGNALS
 from drakerock.loading.signal_table import load_signals
 from drakerock.rocks.shapes import load_rock_shapes
 from drakerock.rocks.state import load_pile
@@ -150,9 +151,9 @@ def _read_curve(place: Path, curve: MeasuredCurve, study: StudyConfig) -> Array:
     if config.signal == PROFILE:
         rocks = study.scenario.rocks
         shapes = load_rock_shapes(rocks)
-        over, values = calc_profile(load_pile(place / "pile_before.npz"), shapes, study.scenario.site)
+        over, values = calc_profile(load_pile(place / PILE_BEFORE), shapes, study.scenario.site)
     else:
-        columns, _ = load_signals(place / "signals.parquet")
+        columns, _ = load_signals(place / SIGNALS)
         for name in (config.signal, config.over):
             if name not in columns:
                 raise InputError(

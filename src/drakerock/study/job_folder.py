@@ -9,17 +9,8 @@ from pathlib import Path
 
 from drakerock.errors import InputError
 from drakerock.files import make_folder
+from drakerock.loading.folder import CYCLE_FILES, REPLAY
 
-_CYCLE_FILES = (
-    "outcome.json",
-    "signals.parquet",
-    "plan.json",
-    "scenario.json",
-    "pile_before.npz",
-    "pile_after.npz",
-    "recording.npz",
-    "replay.html",
-)
 LOCK = ".lock"
 
 
@@ -54,7 +45,7 @@ def use_folder(folder: Path, *, force: bool, sequence: bool) -> Iterator[None]:
 def _make_free(folder: Path, force: bool, sequence: bool) -> None:
     if not sequence and (loadings := sorted(folder.glob("loading_[0-9][0-9]"))):
         raise InputError(f"{folder}: a sequence of {len(loadings)} loadings is there; take another folder")
-    old = [folder / name for name in _CYCLE_FILES if (folder / name).exists()]
+    old = [folder / name for name in (*reversed(CYCLE_FILES), REPLAY) if (folder / name).exists()]
     old += sorted(folder.glob("figure_*.png"))
     if old and not force:
         raise InputError(

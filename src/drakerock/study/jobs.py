@@ -17,6 +17,7 @@ from pydrake.geometry import Meshcat
 from drakerock.exploration.noise import calc_standard_error
 from drakerock.files import make_folder, write_text
 from drakerock.loading.cycle import run_cycle, save_cycle
+from drakerock.loading.folder import RECORDING
 from drakerock.loading.live import make_live_station
 from drakerock.loading.mining import MINING
 from drakerock.loading.outcome import CycleOutcome
@@ -125,7 +126,7 @@ def run_and_save_sequence(
         progress(stage, number / n_loadings, note=note)
 
     def show(place: Path) -> None:
-        if not (place / "recording.npz").exists():
+        if not (place / RECORDING).exists():
             return
         progress("drawing", None, note=place.name)
         if replay:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from drakerock.errors import InputError
 from drakerock.exploration.table import ResponseTable
-from drakerock.loading.folder import REPLAY
+from drakerock.loading.folder import RECORDING, REPLAY
 from drakerock.study.db import Store
 
 
@@ -45,7 +45,7 @@ def update_replay(place: Path, loadings: int = 1) -> Path:
     from drakerock.viewing.replay import write_replay  # takes long to import
 
     page = place / REPLAY
-    if not page.exists() or page.stat().st_mtime < (place / "recording.npz").stat().st_mtime:
+    if not page.exists() or page.stat().st_mtime < (place / RECORDING).stat().st_mtime:
         write_replay(place, loadings=loadings)
     return page
 

@@ -16,6 +16,7 @@ from drakerock.exploration.noise import calc_autocorrelation, calc_means, calc_s
 from drakerock.exploration.problem import Array
 from drakerock.files import make_folder
 from drakerock.identity import get_versions
+from drakerock.loading.folder import OUTCOME
 from drakerock.study.db import Store, calc_inputs_hash, read_outcome
 from drakerock.study.executors import Executor, Losses, WorkerLost, make_executor
 from drakerock.study.objectives import get_objective
@@ -139,7 +140,7 @@ class Resimulation:
 
     def _is_complete(self, task: Task) -> bool:
         """Return whether a sequence has ended: all loadings, or the last with a failure."""
-        paths = [task.folder / f"loading_{k:02d}" / "outcome.json" for k in range(task.n_loadings)]
+        paths = [task.folder / f"loading_{k:02d}" / OUTCOME for k in range(task.n_loadings)]
         there = [path for path in paths if path.exists()]
         return bool(there) and (len(there) == task.n_loadings or read_outcome(there[-1]).status == "failed")
 

@@ -17,6 +17,7 @@ from drakerock.exploration.one_at_a_time import make_one_at_a_time
 from drakerock.exploration.problem import Array, Problem, Variable
 from drakerock.loading.scenario import Scenario
 from drakerock.randomness import derive_seed
+from drakerock.resources import find_study_file
 from drakerock.study.objectives import get_objective, import_module
 
 
@@ -405,7 +406,7 @@ def load_study(path: str | Path, overrides: Sequence[str] = ()) -> StudyConfig:
         InputError: see `drakerock.config.load_config`; also an unknown scenario key or objective, a range
             that the scenario does not allow, a module that cannot be imported.
     """
-    path = Path(path)
+    path = find_study_file(Path(path))
 
     def complete(data: dict[str, Any]) -> None:
         name, changes = data.get("scenario_file"), data.get("scenario") or {}

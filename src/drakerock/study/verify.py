@@ -6,7 +6,7 @@ import json
 import sqlite3
 from dataclasses import dataclass
 
-from drakerock.loading.folder import REPLAY
+from drakerock.loading.folder import OUTCOME, REPLAY
 from drakerock.study.db import DATABASE, POINTS, STUDY, Store, hash_file, write_neutral
 
 
@@ -73,7 +73,7 @@ def _verify_outcomes(store: Store) -> list[Fault]:
     for point, attempt, loading, text in store.db.execute(
         "SELECT point, attempt, loading, outcome FROM cycles ORDER BY point, attempt, loading"
     ):
-        path = store.find_sequence_folder(point, attempt) / f"loading_{loading:02d}" / "outcome.json"
+        path = store.find_sequence_folder(point, attempt) / f"loading_{loading:02d}" / OUTCOME
         try:
             same = json.loads(path.read_text(encoding="utf-8")) == json.loads(text)
         except (OSError, ValueError):

@@ -17,6 +17,7 @@ from typing import Literal, Protocol
 
 from drakerock.errors import InputError
 from drakerock.identity import get_versions
+from drakerock.loading.folder import OUTCOME
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario
 from drakerock.memory import freeze_imports
@@ -144,7 +145,7 @@ def _count_good(task: Task) -> tuple[int, str]:
     """Return how many loadings of a task are done, and the first one's reason that failed, "" if none did."""
     n_good, failure = 0, ""
     for number in range(task.n_loadings):
-        path = task.folder / f"loading_{number:02d}" / "outcome.json"
+        path = task.folder / f"loading_{number:02d}" / OUTCOME
         if not path.exists():
             break
         outcome = read_outcome(path)

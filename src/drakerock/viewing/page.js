@@ -429,7 +429,7 @@ class Chart {
     if (limit) shares.unshift(["% of payload", "payload_share", 100 / limit[1], 0]);
     for (const [label, key, factor, digits] of shares) {
       const field = document.createElement("span");
-      field.innerHTML = key === "fill_factor" ? `<span></span> <b></b>` : `<b></b> <span></span>`;
+      field.innerHTML = place || key === "fill_factor" ? `<span></span> <b></b>` : `<b></b> <span></span>`;
       field.querySelector("span").textContent = (place ? `${"AB"[r]} ` : "") + label;
       const value = field.querySelector("b");
       value.dataset.value = place + key;

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from drakerock.loading.config import PerformanceConfig
 from drakerock.viewing.histories import get_payload
 from drakerock.viewing.stored_cycle import StoredCycle
-
-# Share of loose rock that is rock: what a bucket's volume is taken to hold.
-PACKING = 0.6
 
 
 @dataclass(frozen=True)
@@ -61,8 +59,8 @@ def make_results(cycle: StoredCycle) -> list[Result]:
 def calc_fill_per_kg(cycle: StoredCycle) -> float | None:
     """Return the fill factor of a load of 1 kg: its loose volume over the bucket's heaped capacity.
 
-    As the outcome has it among the numbers of mining, so that both agree. Where it has none: a share of PACKING of
-    loose volume is rock, and the plan's wanted volume, alpha times the capacity, tells the latter; None without a plan.
+    As the outcome has it among the numbers of mining, so that both agree. Where it has none, or nothing was loaded: of
+    the scenario's packing, and of the plan's wanted volume, alpha times the capacity; None without a plan.
     """
     load, known = cycle.outcome.get("bucket_mass_kg"), (cycle.outcome.get("mining") or {}).get("fill_factor")
     if load and known:
@@ -70,7 +68,8 @@ def calc_fill_per_kg(cycle: StoredCycle) -> float | None:
     wanted, alpha = cycle.outcome.get("plan", {}).get("volume_wanted_m3"), cycle.outcome["strategy"]["alpha"]
     if not wanted or not alpha:
         return None
-    return float(alpha / (wanted * PACKING * cycle.scenario["rocks"]["density"]))
+    packing = cycle.scenario["loading"]["performance"].get("loose_packing", PerformanceConfig().loose_packing)
+    return float(alpha / (wanted * packing * cycle.scenario["rocks"]["density"]))
 
 
 def make_title(cycle: StoredCycle) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from drakerock.errors import InputError
 from drakerock.files import read_json
 from drakerock.loading.field import HeightField
+from drakerock.loading.folder import OUTCOME, PLAN, RECORDING, SCENARIO, SIGNALS
 from drakerock.loading.plan import DigPlan
 from drakerock.loading.plan_file import load_plan
 from drakerock.loading.recording import Recording, load_recording
@@ -52,16 +53,16 @@ def load_cycle(folder: str | Path) -> StoredCycle:
         InputError: a file is missing or cannot be read.
     """
     folder = Path(folder)
-    plan, field = load_plan(folder / "plan.json")
-    signals, _ = load_signals(folder / "signals.parquet")
+    plan, field = load_plan(folder / PLAN)
+    signals, _ = load_signals(folder / SIGNALS)
     return StoredCycle(
         folder,
-        _read_object(folder / "outcome.json"),
-        _read_object(folder / "scenario.json"),
+        _read_object(folder / OUTCOME),
+        _read_object(folder / SCENARIO),
         plan if isinstance(plan, DigPlan) else None,
         field,
         signals,
-        load_recording(folder / "recording.npz"),
+        load_recording(folder / RECORDING),
     )
 
 

@@ -16,9 +16,9 @@ from drakerock.viewing.replay import write_comparison, write_replay
 from drakerock.viewing.results import make_results
 from drakerock.viewing.scene_figures import calc_rock_poses
 from drakerock.viewing.stored_cycle import load_cycle
+from tests.browsers import need_browser
 from tests.cycle_files import write_cycle
 
-pytest.importorskip("choreographer", reason="no browser's driver: pip install 'drakerock[film]'")
 SEEN = ("load", "payload_share", "push", "down", "hinge", "speed", "slip", "wheels", "boom", "bucket")
 
 # What the page shows at a time: the panel's numbers, and where rocks and bodies are drawn.
@@ -56,6 +56,7 @@ def cycles(tmp_path_factory, plan, session_recording):
 @pytest.fixture(scope="module")
 def seen(cycles):
     """What one visit of each page shows, by what was done there."""
+    need_browser()
 
     async def visit():
         async with open_page(write_replay(cycles[0]), 640, 400) as page:
@@ -154,6 +155,7 @@ def test_comparison_shows_both_loadings(seen, cycles):
 
 
 def test_films_hold_a_picture_for_each_moment(cycles, tmp_path):
+    need_browser()
     settings = FilmSettings(fps=1.0, speed=4.0, width=240, height=160)
     write_film(cycles[0], tmp_path / "film.gif", settings)
     with Image.open(tmp_path / "film.gif") as picture:
@@ -174,12 +176,14 @@ def test_film_that_cannot_be_made_is_refused(cycles, tmp_path, path, size, messa
 
 @pytest.mark.parametrize(("package", "ending"), [("choreographer", ".gif"), ("imageio_ffmpeg", ".mp4")])
 def test_what_a_film_needs_is_said(cycles, tmp_path, monkeypatch, package, ending):
+    pytest.importorskip("choreographer", reason="without the driver of browsers that is what is said of both")
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(InputError, match=r"pip install 'drakerock\[film\]'"):
         write_film(cycles[0], tmp_path / f"film{ending}", FilmSettings())
 
 
 def test_a_missing_browser_is_said(cycles, monkeypatch):
+    pytest.importorskip("choreographer", reason="without the driver of browsers that is what is said")
     monkeypatch.setenv("BROWSER_PATH", "/nowhere/chromium")
 
     async def visit():

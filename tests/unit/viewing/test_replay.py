@@ -120,7 +120,7 @@ def test_results_are_those_of_the_outcome(folder):
     assert results["load"].value == 8.4
     assert results["payload_share"].show() == "40"  # of 21 t
     # 8.4 t of rock of 2500 kg/m^3, loose with 40 % air, in a bucket of 8.8 / 1.1 = 8 m^3.
-    assert results["fill_factor"].value == pytest.approx(8400 / 2500 / 0.6 / 8.0)
+    assert results["fill_factor"].value == pytest.approx(8400 / 2500 / 0.58 / 8.0)
     assert "8.40 t (40 % of payload) in 6.00 s, damage 0.2500" in make_title(cycle)
     assert make_title(cycle).startswith("alpha 1.1, beta 0.6, gamma 1, kappa 0.6")
 
