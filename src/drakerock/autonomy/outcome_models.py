@@ -1,0 +1,161 @@
+"""What a strategy brings on a pile: three models, each seeing more of the pile than the one before."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from drakerock.autonomy.data import LoadingData
+from drakerock.autonomy.encoding import PileEncoder
+from drakerock.autonomy.entry import PileGrid, calc_entry_features
+from drakerock.autonomy.regression import LandmarkRegressor, find_theta
+from drakerock.exploration.problem import Array, Problem
+from drakerock.exploration.surrogate import Kriging, Surrogate
+from drakerock.loading.features import calc_pile_features
+from drakerock.loading.field import HeightField
+from drakerock.randomness import derive_seed, make_generator
+
+# Codes of the height field that an outcome is taken to depend on besides the entry: the first of each kind.
+_N_EVEN, _N_ODD = 4, 2
+# A Kriging of so many loadings is searched for, and conditioned on, in seconds, and predicts in a tenth of one.
+_SEARCHED, _CONDITIONED = 250, 800
+
+
+class OutcomeModel(Protocol):
+    """Predicts the objectives of loadings."""
+
+    def predict(self, H: Array, X: Array) -> tuple[Array, Array]:
+        """Return expected objectives (m, k), natural senses, and the expectations' standard deviations (m, k).
+
+        Args:
+            H: (m, nx, ny) heights of the piles [m]; or (1, nx, ny), one pile for all.
+            X: (m, d) design points.
+        """
+
+
+class BlindOutcome:
+    """The exploration's surrogate: what a strategy brings on average over the piles of the study."""
+
+    def __init__(self, surrogate: Surrogate) -> None:
+        self._surrogate = surrogate
+
+    def predict(self, H: Array, X: Array) -> tuple[Array, Array]:
+        """Return expectations and standard deviations, see `OutcomeModel`; the pile plays no part."""
+        mean, std = self._surrogate.predict(X, return_std=True)
+        return mean, std
+
+
+class FeatureOutcome:
+    """Kriging over the design variables joined by the features of the pile (`drakerock.loading.features`)."""
+
+    def __init__(self, data: LoadingData, grid: PileGrid, seed: int = 0) -> None:
+        """Fit to loadings."""
+        self._grid, self._problem = grid, data.problem
+        whole = np.isfinite(data.features).all(axis=1)
+        data = data.take(whole)
+        self._centre, spread = data.features.mean(axis=0), data.features.std(axis=0)
+        # Features that hardly differ between loadings tell nothing.
+        self._kept = spread > 1e-6 * (1.0 + np.abs(self._centre))
+        self._spread = np.where(self._kept, spread, 1.0)
+        Z = self._join(data.features, data.X)
+        rng = make_generator(seed, "features")
+        drawn = rng.permutation(len(Z))
+        self._models = []
+        for j in range(data.Y.shape[1]):
+            searched, conditioned = drawn[:_SEARCHED], drawn[:_CONDITIONED]
+            bounds = np.stack([Z.min(axis=0) - 1e-6, Z.max(axis=0) + 1e-6])
+            seed_j = derive_seed(seed, "features", j) % 2**31
+            model = Kriging(bounds, n_starts=8, random_state=seed_j).fit(Z[searched], data.Y[searched, j])
+            if len(Z) > _SEARCHED and not model.constant_:
+                found = Kriging(bounds, theta=model.theta_, lam=model.lam_, n_starts=1, random_state=seed_j)
+                model = found.fit(Z[conditioned], data.Y[conditioned, j])
+            self._models.append(model)
+
+    def predict(self, H: Array, X: Array) -> tuple[Array, Array]:
+        """Return expectations and standard deviations, see `OutcomeModel`."""
+        grid = self._grid
+        rows = [
+            list(
+                vars(
+                    calc_pile_features(HeightField(grid.x, grid.y, h, grid.cell), grid.front_height)
+                ).values()
+            )
+            for h in H
+        ]
+        features = np.nan_to_num(np.array(rows), nan=0.0)
+        Z = self._join(np.broadcast_to(features, (len(X), features.shape[1])), X)
+        pairs = [model.predict(Z, return_std=True) for model in self._models]
+        mean = np.column_stack([pair[0] for pair in pairs])
+        return cut(self._problem, mean), np.column_stack([pair[1] for pair in pairs])
+
+    def _join(self, features: Array, X: Array) -> Array:
+        scaled = (features - self._centre) / self._spread
+        return np.hstack([self._problem.scale(X), scaled[:, self._kept]])
+
+
+class FieldOutcome:
+    """Landmark regression over the design variables, the entry that they lead to and the codes of the height field."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        grid: PileGrid,
+        encoder: PileEncoder,
+        gamma: float,
+        models: tuple[LandmarkRegressor, ...] = (),
+    ) -> None:
+        """Make it of fitted models, one per objective; `fit_field_outcome` fits them.
+
+        Args:
+            problem: variables and objectives.
+            grid: the fields'.
+            encoder: fitted.
+            gamma: where the machine enters if that is no variable.
+            models: over `join`.
+        """
+        self.problem, self.grid, self.encoder, self.gamma, self.models = problem, grid, encoder, gamma, models
+
+    def join(self, H: Array, X: Array) -> Array:
+        """Return what the models see (m, q): a pile and its mirror image are the same to them.
+
+        Arguments as of `predict`.
+        """
+        codes = self.encoder.encode(H) / self.encoder.scale_
+        even, odd = codes[:, self.encoder.mirror_ > 0], codes[:, self.encoder.mirror_ < 0]
+        codes = np.hstack([even[:, :_N_EVEN], np.abs(odd[:, :_N_ODD])])
+        piles = np.broadcast_to(H, (len(X), *H.shape[1:]))
+        entry, _ = calc_entry_features(self.grid, piles, get_gamma(self.problem, X, self.gamma))
+        return np.hstack([self.problem.scale(X), entry, np.broadcast_to(codes, (len(X), codes.shape[1]))])
+
+    def predict(self, H: Array, X: Array) -> tuple[Array, Array]:
+        """Return expectations and standard deviations, see `OutcomeModel`."""
+        Z = self.join(H, X)
+        pairs = [model.predict_with_std(Z) for model in self.models]
+        mean = np.column_stack([pair[0] for pair in pairs])
+        return cut(self.problem, mean), np.column_stack([pair[1] for pair in pairs])
+
+
+def fit_field_outcome(
+    data: LoadingData, grid: PileGrid, encoder: PileEncoder, gamma: float, seed: int = 0
+) -> FieldOutcome:
+    """Return the model fitted to loadings."""
+    blank = FieldOutcome(data.problem, grid, encoder, gamma)
+    Z = blank.join(data.before, data.X)
+    models = []
+    for j in range(data.Y.shape[1]):
+        state = derive_seed(seed, "field", j) % 2**31
+        theta = find_theta(Z, data.Y[:, j], _SEARCHED, state)
+        models.append(LandmarkRegressor(theta, random_state=state).fit(Z, data.Y[:, j]))
+    return FieldOutcome(data.problem, grid, encoder, gamma, tuple(models))
+
+
+def get_gamma(problem: Problem, X: Array, gamma: float) -> Array:
+    """Return where each design point enters (m,): its variable gamma, or the given one where that is none."""
+    names = problem.variable_names
+    return X[:, names.index("gamma")] if "gamma" in names else np.full(len(X), gamma)
+
+
+def cut(problem: Problem, Y: Array) -> Array:
+    """Return objectives (m, k) without values that do not exist, such as negative masses."""
+    return np.maximum(Y, [-np.inf if item.lowest is None else item.lowest for item in problem.objectives])
