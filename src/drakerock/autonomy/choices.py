@@ -105,7 +105,7 @@ class BestFixedChoice(_Unlearning):
 
 
 class PileAwareChoice(_Unlearning):
-    """The strategy of least cost on this pile, by a model that sees the pile."""
+    """The strategy of least cautious cost on this pile, by a model that sees the pile."""
 
     sees_pile = True
 
@@ -131,7 +131,7 @@ class PileAwareChoice(_Unlearning):
 
         def calc_cost(U: Array) -> Array:
             X = problem.unscale(2.0 * U - 1.0)
-            cost = self._scale.calc_cost(preference, *self._model.predict(h, X))
+            cost = self._scale.calc_cautious_cost(preference, *self._model.predict(h, X))
             return cost + BARRED * situation.is_barred(get_gamma(problem, X, self._gamma))
 
         first = self._start.choose(situation, preference)

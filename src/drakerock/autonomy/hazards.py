@@ -15,14 +15,17 @@ from drakerock.exploration.problem import Array
 HazardKind = Literal["debris in the way", "boulder at the entry", "overhang"]
 
 
+# A bump or a face is unusual if it is greater than those of so many piles of the training set.
+_USUAL = 0.98
+
+
 @dataclass(frozen=True)
 class HazardLimits:
-    """From when on it is a hazard.
+    """From when on it is a hazard; `calibrate_limits` raises boulders and faces to what is unusual.
 
     Attributes:
         debris_height: a rock on the machine's way to the pile that is higher [m].
-        boulder_height: a bump that stands out of the pile's surface at the entry by more [m]; the largest rocks of the
-            method are 0.8 m wide and lie half buried.
+        boulder_height: a bump that stands out of the pile's surface at the entry by more [m].
         entry_depth: how far behind the front the entry reaches [m].
         face_angle_deg: a face steeper than this may overhang: a height field cannot tell [deg] ...
         face_height: ... where it is higher than this [m].
@@ -90,6 +93,21 @@ def find_hazards(grid: PileGrid, h: Array, machine_width: float, limits: HazardL
             if there.max() > limit:
                 found.append(Hazard(kind, float(grid.y[j]), float(grid.x[i]), float(there.max())))
     return tuple(found)
+
+
+def calibrate_limits(grid: PileGrid, H: Array, machine_width: float) -> HazardLimits:
+    """Return limits above the bumps and faces of 98 % of piles (n, nx, ny): rocks of the usual size are no boulders."""
+    least = HazardLimits()
+    all_ = HazardLimits(boulder_height=0.0, face_height=0.0)
+    sizes: dict[str, list[float]] = {"boulder at the entry": [], "overhang": []}
+    for h in H:
+        found = find_hazards(grid, h, machine_width, all_)
+        for kind, values in sizes.items():
+            values.append(max((hazard.size for hazard in found if hazard.kind == kind), default=0.0))
+    boulder, face = (float(np.quantile(values, _USUAL)) for values in sizes.values())
+    return HazardLimits(
+        boulder_height=max(least.boulder_height, boulder), face_height=max(least.face_height, face)
+    )
 
 
 def find_pile(grid: PileGrid, h: Array) -> NDArray[np.bool_]:

@@ -83,7 +83,7 @@ class LookAheadChoice:
     def _follow(self, h: Array, steps: list[Array], preference: Preference) -> Array:
         """Return the mean cost of a loading (m,) along sequences of design points (m, d) each."""
         m, r = len(steps[0]), self._n_piles
-        cost = self._scale.calc_cost(preference, *self._outcome.predict(h[None], steps[0]))
+        cost = self._scale.calc_cautious_cost(preference, *self._outcome.predict(h[None], steps[0]))
         if self._depth == 1:
             return cost
         assert self._piles is not None
@@ -92,7 +92,7 @@ class LookAheadChoice:
         for number, following in enumerate(steps[1:]):
             H = self._piles.draw(H, X, _SharedNoise(self._seed, number, m, r))  # type: ignore[arg-type]
             X = np.repeat(following, r, axis=0)
-            now = self._scale.calc_cost(preference, *self._outcome.predict(H, X))
+            now = self._scale.calc_cautious_cost(preference, *self._outcome.predict(H, X))
             cost = cost + now.reshape(m, r).mean(axis=1)
         return cost / self._depth
 

@@ -14,7 +14,7 @@ from drakerock.autonomy.choices import BestFixedChoice, Choice, FixedChoice, Pil
 from drakerock.autonomy.data import LoadingData, read_loading_data
 from drakerock.autonomy.encoding import PileEncoder
 from drakerock.autonomy.entry import PileGrid
-from drakerock.autonomy.hazards import HazardLimits, find_hazards
+from drakerock.autonomy.hazards import HazardLimits, calibrate_limits, find_hazards
 from drakerock.autonomy.look_ahead import LookAheadChoice
 from drakerock.autonomy.novelty import Novelty
 from drakerock.autonomy.outcome_models import BlindOutcome, FeatureOutcome, FieldOutcome, fit_field_outcome
@@ -46,7 +46,7 @@ CHOICES = {
 }
 """Names of the choices, and what they are."""
 
-# The front counts as at least so wide, in ranges of the objectives over the simulated points.
+# The front counts as at least so wide, in ranges of the objectives over nine tenths of the loadings.
 _LEAST_SPREAD = 0.1
 _FRONT = ParetoConfig(population=200, evaluations=12_000, n_draws=0)
 
@@ -113,9 +113,7 @@ class LoaderModel:
             found.append("loading.parts.controller")
         return found
 
-    def look_at(
-        self, field: HeightField, scenario: Scenario, limits: HazardLimits | None = None
-    ) -> Situation:
+    def look_at(self, field: HeightField, scenario: Scenario) -> Situation:
         """Return what a sensed pile is to a choice.
 
         Raises:
@@ -127,7 +125,7 @@ class LoaderModel:
                 f"learned with {' x '.join(map(str, self.data.before.shape[1:]))} of {self.data.cell:g} m"
             )
         grid = self.make_grid(field, scenario)
-        hazards = find_hazards(grid, field.h, self.machine.width, limits or HazardLimits())
+        hazards = find_hazards(grid, field.h, self.machine.width, self.hazard_limits)
         return Situation(field, grid, self.novelty.calc(field.h), hazards)
 
     def make_choice(self, name: str, strategy: StrategyConfig, depth: int = 3) -> Choice:
@@ -192,7 +190,7 @@ class LoaderModel:
     def scale(self) -> CostScale:
         """What costs are relative to."""
         # A front that is all but a point would make a hair's breadth of an objective decide.
-        least = _LEAST_SPREAD * np.ptp(self.surrogate.predict(np.unique(self.data.X, axis=0)), axis=0)
+        least = _LEAST_SPREAD * np.ptp(np.quantile(self.data.Y, (0.05, 0.95), axis=0), axis=0)
         spread = np.maximum(np.abs(self.front.nadir - self.front.ideal), least)
         return CostScale(self.problem, self.front.ideal, self.front.ideal + self.problem.signs * spread)
 
@@ -200,6 +198,11 @@ class LoaderModel:
     def encoder(self) -> PileEncoder:
         """Codes of height fields."""
         return PileEncoder().fit(self.data.before)
+
+    @cached_property
+    def hazard_limits(self) -> HazardLimits:
+        """From when on something is a hazard: what is usual in the study is none."""
+        return calibrate_limits(self.grid, self.data.before, self.machine.width)
 
     @cached_property
     def novelty(self) -> Novelty:

@@ -19,7 +19,8 @@ from drakerock.randomness import derive_seed, make_generator
 # Codes of the height field that an outcome is taken to depend on besides the entry: the first of each kind.
 _N_EVEN, _N_ODD = 4, 2
 # A Kriging of so many loadings is searched for, and conditioned on, in seconds, and predicts in a tenth of one.
-_SEARCHED, _CONDITIONED = 250, 800
+_SEARCHED, _CONDITIONED = 200, 800
+_TAIL = 0.01
 
 
 class OutcomeModel(Protocol):
@@ -64,12 +65,13 @@ class FeatureOutcome:
         self._models = []
         for j in range(data.Y.shape[1]):
             searched, conditioned = drawn[:_SEARCHED], drawn[:_CONDITIONED]
+            y = tame(data.Y[:, j])
             bounds = np.stack([Z.min(axis=0) - 1e-6, Z.max(axis=0) + 1e-6])
             seed_j = derive_seed(seed, "features", j) % 2**31
-            model = Kriging(bounds, n_starts=8, random_state=seed_j).fit(Z[searched], data.Y[searched, j])
+            model = Kriging(bounds, n_starts=4, random_state=seed_j).fit(Z[searched], y[searched])
             if len(Z) > _SEARCHED and not model.constant_:
                 found = Kriging(bounds, theta=model.theta_, lam=model.lam_, n_starts=1, random_state=seed_j)
-                model = found.fit(Z[conditioned], data.Y[conditioned, j])
+                model = found.fit(Z[conditioned], y[conditioned])
             self._models.append(model)
 
     def predict(self, H: Array, X: Array) -> tuple[Array, Array]:
@@ -145,9 +147,18 @@ def fit_field_outcome(
     models = []
     for j in range(data.Y.shape[1]):
         state = derive_seed(seed, "field", j) % 2**31
-        theta = find_theta(Z, data.Y[:, j], _SEARCHED, state)
-        models.append(LandmarkRegressor(theta, random_state=state).fit(Z, data.Y[:, j]))
+        y = tame(data.Y[:, j])
+        theta = find_theta(Z, y, _SEARCHED, state)
+        models.append(LandmarkRegressor(theta, random_state=state).fit(Z, y))
     return FieldOutcome(data.problem, grid, encoder, gamma, tuple(models))
+
+
+def tame(y: Array) -> Array:
+    """Return responses (n,) without their outliers: what lies in the last hundredth at either end counts as its border.
+
+    A loading that jams has a hundred times the damage of others; one of them would bend the regression for all.
+    """
+    return np.clip(y, *np.quantile(y, (_TAIL, 1.0 - _TAIL)))
 
 
 def get_gamma(problem: Problem, X: Array, gamma: float) -> Array:

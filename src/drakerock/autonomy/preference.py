@@ -47,6 +47,14 @@ class CostScale:
     ideal: Array
     nadir: Array
 
+    def calc_cautious_cost(self, preference: Preference, Y: Array, std: Array) -> Array:
+        """Return costs (n,) with each objective one standard deviation of its prediction worse than expected.
+
+        Who searches for the least predicted cost finds where the model errs to its favour; this keeps the search where
+        something is known. Arguments as of `calc_cost`.
+        """
+        return self.calc_cost(preference, Y + self.problem.signs * std, std)
+
     def calc_cost(self, preference: Preference, Y: Array, std: Array) -> Array:
         """Return what a loading costs (n,): as `choose_strategy` weighs a front, plus a penalty for broken bounds.
 

@@ -117,4 +117,4 @@ def find_theta(Z: Array, y: Array, most: int, seed: int) -> Array:
     U = ((Z - centre) / spread)[rows]
     # The Kriging's own scaling to [-1, 1] is then none.
     bounds = np.stack([-np.ones(Z.shape[1]), np.ones(Z.shape[1])])
-    return np.asarray(Kriging(bounds, n_starts=8, random_state=seed % 2**31).fit(U, y[rows]).theta_)
+    return np.asarray(Kriging(bounds, n_starts=4, random_state=seed % 2**31).fit(U, y[rows]).theta_)

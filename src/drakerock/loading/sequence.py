@@ -124,6 +124,7 @@ def _run_loading(
             progress(number, stage, time)
 
     meter = Meter()
+
     def advance(mode: str, time: float) -> None:
         tell(mode.lower(), time)
 

@@ -64,7 +64,7 @@ class World:
         return came, after, np.maximum(following, 0.0)
 
 
-def make_data(n_points=60, n_loadings=6, seed=0, world=None):
+def make_data(n_points=60, n_loadings=4, seed=0, world=None):
     world = world or World(seed)
     problem = Problem()
     rows = []

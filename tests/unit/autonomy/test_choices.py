@@ -31,7 +31,7 @@ def look(model, h):
     return model.look_at(HeightField(X, Y, h, CELL), SCENARIO)
 
 
-def run(model, choice, seed, n_piles=6, n_loadings=3):
+def run(model, choice, seed, n_piles=4, n_loadings=3):
     """Return the expected production of loadings on unseen piles (n,)."""
     world, total = World(seed), []
     for _ in range(n_piles):
@@ -55,7 +55,7 @@ def test_a_proposal_is_inside_the_ranges_and_the_same_again(model, choices, name
     assert choice.name == name
 
 
-@pytest.mark.parametrize("name", ["best_fixed", "features", "field", "look_ahead"])
+@pytest.mark.parametrize("name", ["features", "field", "look_ahead"])
 def test_another_preference_is_another_strategy(model, choices, name):
     situation = look(model, World(8).make_pile())
     careful = Preference((("damage", 1.0),))
@@ -98,15 +98,14 @@ def test_the_bandit_learns_at_a_site_that_differs_from_the_study(model, choices)
             return came
 
     choice, site, betas, total = choices["bandit"], Site(12), [], []
-    h = site.make_pile()
-    for _ in range(40):
+    for _ in range(30):
+        h = site.make_pile()
         x = choice.choose(look(model, h), MOST).x
         betas.append(x[1])
         total.append(site.expect(h, x)[0])
-        came, _, h = site.load(h, x)
-        choice = choice.learn(h, x, came)
-    assert np.mean(total[-12:]) > 1.15 * np.mean(total[:6])
-    assert np.mean(np.array(betas[-12:]) >= 0.6) > 0.6
+        choice = choice.learn(h, x, site.load(h, x)[0])
+    assert np.mean(total[-10:]) > 1.15 * np.mean(total[:6])
+    assert np.mean(np.array(betas[-10:]) >= 0.6) > 0.6
 
 
 @pytest.mark.parametrize("name", NAMES)

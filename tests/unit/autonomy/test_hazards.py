@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drakerock.autonomy.entry import PileGrid
-from drakerock.autonomy.hazards import HazardLimits, find_hazards, find_pile
+from drakerock.autonomy.hazards import HazardLimits, calibrate_limits, find_hazards, find_pile
 from drakerock.loading.field import HeightField, calc_pile_profile
 from drakerock.loading.sensing import make_grid
 from drakerock.rocks.config import SiteConfig
@@ -58,6 +58,26 @@ def test_a_face_may_overhang():
     face = make_slope() + np.where(X > -2.5, 2.0, 0.0)[:, None]
     assert "overhang" in {hazard.kind for hazard in find(face)}
     assert "2." in next(str(hazard) for hazard in find(face) if hazard.kind == "overhang")
+
+
+def test_rocks_of_the_usual_size_are_no_boulders():
+    """Caught: on a pile of rocks of up to 0.8 m nearly every entry had a boulder."""
+    rng = np.random.default_rng(1)
+
+    def scatter(height):
+        h = make_slope()
+        for _ in range(60):
+            h = put(h, rng.uniform(-4, 0), rng.uniform(-3, 3), height)
+        return h
+
+    piles = np.array([scatter(0.8) for _ in range(30)])
+    limits = calibrate_limits(GRID, piles, 3.1)
+    assert limits.boulder_height > 0.6
+    usual = [any(z.kind == "boulder at the entry" for z in find_hazards(GRID, h, 3.1, limits)) for h in piles]
+    assert np.mean(usual) <= 0.05
+    boulder = put(make_slope(), -3.0, 0.0, limits.boulder_height + 0.3)
+    assert {hazard.kind for hazard in find_hazards(GRID, boulder, 3.1, limits)} == {"boulder at the entry"}
+    assert calibrate_limits(GRID, make_slope()[None], 3.1) == HazardLimits()
 
 
 def test_what_is_pile_is_the_planner_s():
