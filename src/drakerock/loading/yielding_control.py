@@ -1,13 +1,14 @@
 """Controllers that yield to the pile: admittance, and slip control as operators do it. Alternatives to feed-forward.
 
 A scenario names them as ``loading.parts.controller``: ``drakerock.loading.yielding_control:make_admittance`` or
-``...:make_slip_control``. Both drive the plan's joint rates, as `FeedforwardController` does, and change them:
+``...:make_slip_control``. Both take the plan's joint rates (wheels phi'_w, boom phi'_l, bucket phi'_b), as
+`FeedforwardController` does, and change them:
 
-    admittance     q' = q'_plan / (1 + F / F_half)               while the bucket digs, [s0, s3]
-    slip control   wheels: phi'_w (1 - e), boom: phi'_l - lift e / ease       while the machine pushes, [s0, s2]
+    admittance     phi' / (1 + F / F_half) for all three, on [s0, s3]
+    slip control   phi'_w (1 - e) for the wheels, phi'_l - lift e / ease for the boom, on [s0, s2]
 
-with F the rocks' force on the bucket, averaged by a filter of the first order, and e in [0, ease] rising with the slip
-ratio (r_w phi'_w - v_F) / (r_w phi'_w) beyond the one that is allowed. A raised boom puts the pile's weight on the front
+with F the rocks' force on the bucket, filtered to the first order, and e in [0, ease] rising with the slip ratio
+(r_w phi'_w - v_F) / (r_w phi'_w) beyond the one that is allowed. A raised boom puts the pile's weight on the front
 wheels, which then grip.
 """
 

@@ -89,7 +89,7 @@ def test_looking_ahead_leaves_the_better_pile(model):
 
 
 def test_the_bandit_learns_at_a_site_that_differs_from_the_study(model, choices):
-    """Where production is a third less for low beta, which the study did not know."""
+    """Where production is half for low beta, which the study did not know."""
 
     class Site(World):
         def expect(self, h, x):
@@ -104,8 +104,9 @@ def test_the_bandit_learns_at_a_site_that_differs_from_the_study(model, choices)
         betas.append(x[1])
         total.append(site.expect(h, x)[0])
         choice = choice.learn(h, x, site.load(h, x)[0])
-    assert np.mean(total[-10:]) > 1.15 * np.mean(total[:6])
-    assert np.mean(np.array(betas[-10:]) >= 0.6) > 0.6
+    assert min(total[:6]) < 500.0  # it tried what the study advises
+    assert np.mean(total[-10:]) > 850.0  # of 885 at beta 0.6
+    assert np.mean(np.array(betas[-10:]) >= 0.6) >= 0.9
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -105,10 +105,10 @@ def test_draws_scatter_as_the_posterior():
     rng = np.random.default_rng(4)
     Z = rng.normal(size=(60, 2))
     model = LandmarkRegressor(np.ones(2), 30).fit(Z, rng.normal(size=60))
-    draws = np.array([model.draw(Z[:5], np.random.default_rng(k)) for k in range(2000)])
+    draws = np.array([model.draw(Z[:5], np.random.default_rng(k)) for k in range(500)])
     mean, std = model.predict_with_std(Z[:5])
-    assert np.allclose(draws.mean(axis=0), mean, atol=4 * std.max() / np.sqrt(2000))
-    assert np.allclose(draws.std(axis=0), std, rtol=0.1)
+    assert np.allclose(draws.mean(axis=0), mean, atol=4 * std.max() / np.sqrt(500))
+    assert np.allclose(draws.std(axis=0), std, rtol=0.15)
 
 
 def test_who_sees_the_pile_predicts_better(model, unseen):
