@@ -4,7 +4,7 @@
     python benchmarks/autonomy.py accuracy out/full_size --out out/autonomy
     nice python benchmarks/autonomy.py run out/full_size --out out/autonomy --loadings 15
     python benchmarks/autonomy.py table out/autonomy
-    python benchmarks/autonomy.py run out/small --scenario studies/small.yaml --piles seed_11 --loadings 2 --out out/tiny
+    python benchmarks/autonomy.py run out/small --scenario studies/small.yaml --piles seed_11 --loadings 2
 
 `speed` measures training on so many loadings of formulas' piles, on the method's grid, and a decision of each
 choice [CPU s]. `accuracy` holds the models of outcome and pile against design points that were not fitted to, over the
@@ -48,14 +48,14 @@ COARSE = [
     {"size_m": 0.4, "mass_fraction": 0.2}, {"size_m": 0.6, "mass_fraction": 0.3}, {"size_m": 0.8, "mass_fraction": 0.3},
     {"size_m": 1.0, "mass_fraction": 0.2},
 ]  # fmt: skip
-# Starting piles of other seeds; flatter and steeper ones by the rocks' friction; other voids behind the brow, which press
-# on the slope otherwise; coarser rock.
+# Starting piles of other seeds; flatter and steeper ones by the rocks' friction; other voids behind the brow, which
+# press on the slope otherwise; coarser rock.
 PILES: dict[str, dict[str, Any]] = {
     **{f"seed_{seed}": {"seed": seed} for seed in range(11, 16)},
     "smooth_21": {"seed": 21, "rocks.friction": 0.6},
     "smooth_22": {"seed": 22, "rocks.friction": 0.7},
     "rough_23": {"seed": 23, "rocks.friction": 1.2},
-    "taper_24": {"seed": 24, "site.void_taper_deg": 8.0},
+    "taper_24": {"seed": 24, "site.void_taper_deg": 6.0},
     "shallow_25": {"seed": 25, "site.void_depth": 7.0},
     "coarse_26": {"seed": 26, "rocks.gradation": COARSE},
     "seed_27": {"seed": 27},

@@ -35,10 +35,14 @@ class PileEncoder(BaseEstimator):
         self.shape_ = H.shape[1:]
         mirrored = H[:, :, ::-1]
         most = min(len(H) - 1, H[0].size)
-        self.even_ = PCA(min(self.n_even, most), svd_solver="full").fit(_flatten(0.5 * (H + mirrored)))
+        self.even_ = PCA(min(self.n_even, most), svd_solver="randomized", random_state=0).fit(
+            _flatten(0.5 * (H + mirrored))
+        )
         odd = _flatten(0.5 * (H - mirrored))
         # The odd parts of a field and of its mirror image are equal but for the sign: their mean is zero.
-        self.odd_ = PCA(min(self.n_odd, most), svd_solver="full").fit(np.vstack([odd, -odd]))
+        self.odd_ = PCA(min(self.n_odd, most), svd_solver="randomized", random_state=0).fit(
+            np.vstack([odd, -odd])
+        )
         self.mirror_ = np.repeat([1.0, -1.0], [self.even_.n_components_, self.odd_.n_components_])
         codes = self.encode(H)
         self.scale_ = np.maximum(codes.std(axis=0), 1e-6)
