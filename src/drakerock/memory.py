@@ -6,6 +6,8 @@ So a system of ours keeps
 
 - no callback of an abstract port or a cache entry but by `weak` (vector ports and events need no such care);
 - no cache entry, body, frame, joint, output port or geometry id of the plant: their indices, and looks them up.
+
+A context has a trap of its own, see `get_own_context`.
 """
 
 from __future__ import annotations
@@ -15,6 +17,8 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 from weakref import WeakMethod
+
+from pydrake.systems.framework import Context, System
 
 
 def weak[Result](method: Callable[..., Result]) -> Callable[..., Result]:
@@ -27,6 +31,19 @@ def weak[Result](method: Callable[..., Result]) -> Callable[..., Result]:
         return bound(*arguments)
 
     return call
+
+
+def get_own_context(system: System, root_context: Context) -> Context:
+    """Return a system's context, to be changed, in that of the Diagram it is a part of; it may be that Diagram itself.
+
+    Asked for the whole Diagram's own context, Drake's `GetMyMutableContextFromRoot` returns the context it was given
+    and makes it keep itself alive, all rocks included.
+    """
+    try:
+        system.ValidateContext(root_context)
+    except RuntimeError:  # that of a larger Diagram
+        return system.GetMyMutableContextFromRoot(root_context)
+    return root_context
 
 
 @cache

@@ -29,7 +29,14 @@ def simulate(scenario, pile):
         station.diagram.get_output_port(k).Eval(root)
     station.rocks.get_pile(root)
     parts = {system.get_name(): weakref.ref(system) for system in station.diagram.GetSystems()}
-    return parts | {"diagram": weakref.ref(station.diagram), "simulator": weakref.ref(simulator)}
+    whole = {"diagram": station.diagram, "simulator": simulator, "context": root, "states": read_states(station, root)}
+    return parts | {name: weakref.ref(part) for name, part in whole.items()}
+
+
+def read_states(station, root):
+    """Return what holds the rocks' state in a context."""
+    context = station.rocks.GetMyContextFromRoot(root)
+    return context.get_abstract_state().get_value(0).get_value() if context.num_abstract_states() else station
 
 
 @pytest.mark.parametrize("rocks", ["nonsmooth", "plant"])

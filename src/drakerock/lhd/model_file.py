@@ -85,6 +85,7 @@ def check_machine_file(config: MachineConfig) -> MachineFile:
     with _refuse_failures(config.model, path):
         plant.Finalize()
         check.run()
+    builder.Build()  # pydrake frees a plant only with its Diagram
     # Drake tells some of what the outline finds.
     ignored = dict.fromkeys([*outline.ignored, *warnings, *check.ignored])
     return MachineFile(path, check.loops, tuple(ignored))

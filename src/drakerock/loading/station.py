@@ -38,6 +38,7 @@ from drakerock.loading.scenario import Scenario
 from drakerock.loading.segments import SegmentTracker
 from drakerock.loading.sensing import PileSensor
 from drakerock.loading.steering import LineSteering
+from drakerock.memory import get_own_context
 from drakerock.rocks.drake.drift import AddDrift
 from drakerock.rocks.drake.interface import RockSystem
 from drakerock.rocks.drake.plant import add_plant
@@ -97,8 +98,7 @@ class Station:
             InputError: the machine cannot reach its starting pose.
         """
         loading = self.scenario.loading
-        # The Diagram may be a part of a larger one.
-        context = self.diagram.GetMyMutableContextFromRoot(root_context)
+        context = get_own_context(self.diagram, root_context)
         root_context.SetTime(0.0)
         context.SetStateAndParametersFrom(self.diagram.CreateDefaultContext())
         self.rocks.set_pile(root_context, self.rocks.pile)
