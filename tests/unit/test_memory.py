@@ -29,7 +29,12 @@ def simulate(scenario, pile):
         station.diagram.get_output_port(k).Eval(root)
     station.rocks.get_pile(root)
     parts = {system.get_name(): weakref.ref(system) for system in station.diagram.GetSystems()}
-    whole = {"diagram": station.diagram, "simulator": simulator, "context": root, "states": read_states(station, root)}
+    whole = {
+        "diagram": station.diagram,
+        "simulator": simulator,
+        "context": root,
+        "states": read_states(station, root),
+    }
     return parts | {name: weakref.ref(part) for name, part in whole.items()}
 
 

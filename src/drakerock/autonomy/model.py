@@ -255,7 +255,9 @@ def measure_machine(scenario: Scenario) -> DiggingMachine:
     Raises:
         InputError: its SDFormat file cannot be used.
     """
-    plant, scene_graph = add_plant(DiagramBuilder(), scenario.dynamics)
+    builder = DiagramBuilder()
+    plant, scene_graph = add_plant(builder, scenario.dynamics)
     machine = add_machine(plant, scenario.machine)
     plant.Finalize()
+    builder.Build()  # pydrake frees a plant only with its Diagram
     return make_digging_machine(plant, scene_graph, machine)
