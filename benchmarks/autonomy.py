@@ -4,6 +4,7 @@
     python benchmarks/autonomy.py accuracy out/full_size --out out/autonomy
     nice python benchmarks/autonomy.py run out/full_size --out out/autonomy --loadings 15
     python benchmarks/autonomy.py table out/autonomy
+    nice python benchmarks/autonomy.py control --out out/control --seeds 11 12 13
     python benchmarks/autonomy.py run out/small --scenario studies/small.yaml --piles seed_11 --loadings 2
 
 `speed` measures training on so many loadings of formulas' piles, on the method's grid, and a decision of each
@@ -13,6 +14,10 @@ share of the points that was: the learning curve.
 `run` loads from each starting pile with each choice, a sequence of its own each; what is stored is skipped, so it can
 be stopped and continued. No pile has a seed of the study's. `--choices look_ahead:1 look_ahead:2 look_ahead:3` is the
 ablation of the depth, `--shares 0.25 0.5 1` that of the amount of training data.
+
+`control` loads once from the same piles with the same plans (the method's three reference strategies) under
+feed-forward, admittance and slip control, with their default gains, and prints the means with paired differences to
+feed-forward.
 
 `table` gives means with 90 % intervals of the paired differences to `best_fixed`, over piles (bootstrap), as
 JSON, Markdown and picture. The pairs share the starting pile; refills differ as soon as the piles do.
@@ -24,6 +29,7 @@ import argparse
 import json
 import time
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +41,16 @@ from drakerock.autonomy.outcome_models import BlindOutcome
 from drakerock.autonomy.preference import make_preference
 from drakerock.autonomy.sequence import Adviser, run_autonomous
 from drakerock.errors import DrakerockError
-from drakerock.exploration.problem import Problem
+from drakerock.exploration.problem import REFERENCE_STRATEGIES, Problem
 from drakerock.files import make_folder, write_text
 from drakerock.loading.config import StrategyConfig
+from drakerock.loading.cycle import run_cycle
 from drakerock.loading.features import PileFeatures, calc_pile_features
 from drakerock.loading.field import HeightField
 from drakerock.loading.scenario import Scenario, load_scenario
 from drakerock.loading.sensing import make_grid
 from drakerock.randomness import make_generator
+from drakerock.study.jobs import get_pile
 
 COARSE = [
     {"size_m": 0.4, "mass_fraction": 0.2}, {"size_m": 0.6, "mass_fraction": 0.3}, {"size_m": 0.8, "mass_fraction": 0.3},
@@ -202,6 +210,65 @@ def run_sequences(args: argparse.Namespace) -> None:
                 drop_large_files(folder)
 
 
+CONTROLLERS: dict[str, dict[str, Any]] = {
+    "feed-forward": {},
+    "admittance": {"loading.parts.controller.system": "drakerock.loading.yielding_control:make_admittance"},
+    "slip control": {
+        "loading.parts.controller.system": "drakerock.loading.yielding_control:make_slip_control"
+    },
+}
+
+
+def run_control(args: argparse.Namespace) -> None:
+    """Compare the controllers, one loading each; what is stored is skipped."""
+    make_folder(args.out)
+    path = args.out / "control.json"
+    rows: list[dict[str, Any]] = json.loads(path.read_text()) if path.exists() else []
+    base = load_scenario(args.scenario, args.set or [])
+    known = {(row["seed"], row["strategy"], row["controller"]) for row in rows}
+    for seed, (label, values) in product(args.seeds, REFERENCE_STRATEGIES.items()):
+        strategy = dict(zip(("alpha", "beta", "gamma", "kappa"), values, strict=True))
+        scenario = base.replace(**{"seed": seed, "loading.strategy": strategy})
+        for controller, changes in CONTROLLERS.items():
+            if (seed, label, controller) in known:
+                continue
+            outcome = run_cycle(scenario.replace(**changes), get_pile(scenario)).outcome
+            numbers = {name: (outcome.mining or {}).get(name) for name in ("wheel_slip_m",)}
+            numbers |= {
+                name: getattr(outcome, name) for name in ("bucket_mass_kg", "loading_time_s", "energy_J")
+            }
+            row = {"seed": seed, "strategy": label, "controller": controller, "reason": outcome.reason}
+            rows.append(row | outcome.objectives | numbers)
+            write_text(path, json.dumps(rows, indent=1) + "\n")
+            print(json.dumps(rows[-1]), flush=True)
+    print_control(rows)
+
+
+def print_control(rows: list[dict[str, Any]]) -> None:
+    names = (*OBJECTIVES, "wheel_slip_m", "bucket_mass_kg", "loading_time_s")
+    pairs: dict[tuple[int, str], dict[str, dict[str, Any]]] = {}
+    for row in rows:
+        pairs.setdefault((row["seed"], row["strategy"]), {})[row["controller"]] = row
+    whole = [pair for pair in pairs.values() if len(pair) == len(CONTROLLERS)]
+    print(f"| controller ({len(whole)} pairs) | {' | '.join(names)} |")
+    print(f"|{'---|' * (len(names) + 1)}")
+    for controller in CONTROLLERS:
+        cells = []
+        for name in names:
+            values = np.array([_get(pair[controller][name]) for pair in whole])
+            cell = f"{np.nanmean(values):.4g}"
+            if controller != "feed-forward":
+                base = np.array([_get(pair["feed-forward"][name]) for pair in whole])
+                mean, low, high = calc_interval(values - base)
+                cell += f" ({mean:+.3g}" + (f", {low:+.3g} to {high:+.3g})" if low is not None else ")")
+            cells.append(cell)
+        print(f"| {controller} | {' | '.join(cells)} |")
+
+
+def _get(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
 def drop_large_files(folder: Path) -> None:
     """Keep what the table, the page and going on need: outcomes, decisions, plans, fields, the last pile."""
     places = sorted(folder.glob("loading_*"))
@@ -331,6 +398,11 @@ def main() -> None:
     run.add_argument("--loadings", type=int, default=15)
     run.add_argument("--weights", default="production=0.6,damage=0.2,debris=0.2")
     run.add_argument("--bound", nargs="*")
+    control = commands.add_parser("control")
+    control.add_argument("--out", type=Path, default=Path("out/control"))
+    control.add_argument("--scenario", type=Path)
+    control.add_argument("--set", nargs="*")
+    control.add_argument("--seeds", type=int, nargs="+", default=[11, 12, 13])
     table = commands.add_parser("table")
     table.add_argument("folder", type=Path)
     args = parser.parse_args()
@@ -340,6 +412,8 @@ def main() -> None:
         run_accuracy(args.study, args.out, args.shares, args.seed)
     elif args.command == "run":
         run_sequences(args)
+    elif args.command == "control":
+        run_control(args)
     else:
         write_table(args.folder)
 

@@ -43,6 +43,7 @@ class LoadingData:
         point: (n,) names of the design points.
         attempt, loading: (n,) numbers from 0.
         role: (n,) sample or validation.
+        keys: (d,) the scenario keys that the variables set, None for choices; empty: not known.
     """
 
     problem: Problem
@@ -60,15 +61,15 @@ class LoadingData:
     attempt: NDArray[np.int_]
     loading: NDArray[np.int_]
     role: NDArray[np.str_]
+    keys: tuple[str | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.X)
 
     def take(self, rows: NDArray[np.int_] | NDArray[np.bool_]) -> Self:
         """Return the rows of a mask or of indices."""
-        names = [
-            item.name for item in fields(self) if item.name not in ("problem", "scenario", "x", "y", "cell")
-        ]
+        whole = ("problem", "scenario", "x", "y", "cell", "keys")
+        names = [item.name for item in fields(self) if item.name not in whole]
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def get_field(self, row: int) -> HeightField:
@@ -133,7 +134,8 @@ def read_loading_data(source: str | Path) -> LoadingData:
             loadings, piles = read_loadings(store), read_height_fields(store)
     else:
         loadings, piles = (_read_table(folder / f"{name}.parquet") for name in ("loadings", "height_fields"))
-    return _join(folder, study.problem, study.scenario, loadings, piles)
+    data = _join(folder, study.problem, study.scenario, loadings, piles)
+    return replace(data, keys=tuple(variable.key for variable in study.variables))
 
 
 def _read_table(path: Path) -> pa.Table:
@@ -190,7 +192,8 @@ def _join(
         np.array([[row[name] for name in problem.objective_names] for row in rows], dtype=float),
         before, after, following,
         np.array([[pile[name] for name in PileFeatures.list_names()] for pile in of_pile], dtype=float),
-        *(np.array([row[name] for row in rows]) for name in (*_KEY, "role")),
+        point=np.array([row["point"] for row in rows]), attempt=np.array([row["attempt"] for row in rows]),
+        loading=np.array([row["loading"] for row in rows]), role=np.array([row["role"] for row in rows]),
     )  # fmt: skip
 
 

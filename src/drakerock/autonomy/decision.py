@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -45,8 +46,9 @@ class Decision:
     x: tuple[float, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON."""
-        return asdict(self)
+        """Return plain data for JSON; a novelty that is not known is null."""
+        known = math.isfinite(self.novelty)
+        return asdict(self) | {"novelty": self.novelty if known else None}
 
 
 def decide(

@@ -65,7 +65,12 @@ class LoaderModel:
 
     def __init__(self, data: LoadingData, seed: int = 0, machine: DiggingMachine | None = None) -> None:
         known = tuple(StrategyConfig.model_fields)
-        other = [name for name in data.problem.variable_names if name not in known]
+        keys = data.keys or tuple(f"loading.strategy.{name}" for name in data.problem.variable_names)
+        other = [
+            f"{name} ({key})" if name in known else name
+            for name, key in zip(data.problem.variable_names, keys, strict=True)
+            if name not in known or key != f"loading.strategy.{name}"
+        ]
         if other:
             raise InputError(
                 f"the study varies {', '.join(other)}; an autonomous loader chooses among {', '.join(known)} only"
@@ -89,24 +94,26 @@ class LoaderModel:
     def check_fits(self, scenario: Scenario) -> None:
         """Raise InputError if a scenario's machine or sensor is another one than the study's."""
         study = self.data.scenario
-        if calc_config_hash(scenario.machine) != calc_config_hash(study.machine):
+        one, two = (calc_config_hash(item.resolve().machine) for item in (study, scenario))
+        if one != two:
             raise InputError(
                 f"the model was learned with another machine ({study.machine.model}) than the scenario's "
                 f"({scenario.machine.model}); what it advises holds for that one only"
             )
-        for key, one, two in (
+        for key, learned, given in (
             ("site.drift_width", study.site.drift_width, scenario.site.drift_width),
             ("site.drift_length", study.site.drift_length, scenario.site.drift_length),
             ("loading.sensing.cell", study.loading.sensing.cell, scenario.loading.sensing.cell),
         ):
-            if abs(one - two) > 1e-9:
+            if abs(learned - given) > 1e-9:
                 raise InputError(
-                    f"the model was learned with {key} = {one:g}, the scenario has {two:g}: their height fields differ"
+                    f"the model was learned with {key} = {learned:g}, the scenario has {given:g}: their height fields "
+                    "differ"
                 )
 
     def list_differences(self, scenario: Scenario) -> list[str]:
         """Return which parts of the loading a scenario has otherwise than the study; predictions may be off by them."""
-        names = ("planning", "control", "steering", "performance")
+        names = ("sensing", "planning", "control", "steering", "performance")
         one, two = self.data.scenario.loading, scenario.loading
         found = [f"loading.{name}" for name in names if getattr(one, name) != getattr(two, name)]
         if one.parts.controller != two.parts.controller:

@@ -139,8 +139,8 @@ class _Sequence:
             station, decision = self._decide(scenario, pile, choice, preference, cleaned=True)
             decision = _join(first, decision)
         make_folder(place)
-        text = json.dumps(decision.to_dict() | {"cleaned_kg": cleaned_kg, "number": number}, indent=2)
-        write_text(place / DECISION, text.replace("NaN", "null") + "\n")
+        told = decision.to_dict() | {"cleaned_kg": cleaned_kg, "number": number}
+        write_text(place / DECISION, json.dumps(told, indent=2, allow_nan=False) + "\n")
         if decision.action == "stop":
             raise InputError(f"loading {number + 1}: {decision.reasons[-1]}")
         if self._decided:

@@ -235,6 +235,23 @@ def test_a_study_of_other_variables_is_refused(loadings):
         LoaderModel(replace(loadings, problem=problem))
 
 
+def test_a_variable_that_is_called_like_a_strategy_s_and_is_none_is_refused(loadings):
+    from dataclasses import replace
+
+    keys = (
+        "loading.strategy.alpha",
+        "loading.planning.v_x_max",
+        "loading.strategy.gamma",
+        "loading.strategy.kappa",
+    )
+    with pytest.raises(InputError, match=r"the study varies beta \(loading\.planning\.v_x_max\)"):
+        LoaderModel(replace(loadings, keys=keys))
+
+
+def test_a_stored_scenario_has_the_same_machine(model):
+    model.check_fits(SCENARIO.resolve())
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
