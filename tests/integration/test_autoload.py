@@ -246,6 +246,7 @@ def test_the_command_loads_tells_and_goes_on(run_command, scenario_file, study, 
     assert code == 0
     assert "1 loadings by field" in shown
     assert "learned from 36 loadings at 9 points" in said
+    assert "explained of what single loadings at other points differ by: production" in said
     assert "loading 1: alpha" in said
     # Sixty rocks are no slope of the study: it says so, and the robust strategy stands in.
     assert "unlike those learned from" in said

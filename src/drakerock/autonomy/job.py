@@ -83,6 +83,8 @@ def run_autoload(
     say(f"learned from {len(model.data)} loadings at {n_points} points of {job.source}")
     if differs := model.list_differences(scenario):
         say(f"warning: the study has another {', '.join(differs)}; predictions may be off")
+    for line in describe_skill(model, job.choice):
+        say(line)
     freeze_imports()
 
     def tell(number: int, stage: str, time: float) -> None:
@@ -110,6 +112,22 @@ def run_autoload(
         write_text(folder / "sequence.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
         page = write_autonomy_page(folder)
     return summary, [page, folder / "sequence.json"]
+
+
+def describe_skill(model: LoaderModel, choice: str) -> list[str]:
+    """Return in lines how well what a choice relies on foretold loadings that were not learned from."""
+    if choice in ("fixed", "best_fixed"):
+        return []
+    skill = model.field_outcome.skill
+    shown = ", ".join(f"{name} {100 * max(value, 0.0):.0f} %" for name, value in skill.items())
+    lines = [f"explained of what single loadings at other points differ by: {shown}"]
+    if choice == "look_ahead":
+        lines[0] += f"; of what becomes of the pile: {100 * max(model.pile_model.skill, 0.0):.0f} %"
+    if all(value <= 0.0 for value in skill.values()):
+        lines.append(
+            "warning: the loadings teach nothing about other points; --choice best_fixed is as good, or more data"
+        )
+    return lines
 
 
 def read_schedule(model: LoaderModel, job: AutoloadJob) -> Callable[[int], Preference]:

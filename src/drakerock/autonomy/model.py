@@ -182,8 +182,10 @@ class LoaderModel:
         """
         data = self.data
         n = len(data)
+        # Attempts at one point are sequences of their own.
+        sequences = [f"{point}/{attempt}" for point, attempt in zip(data.point, data.attempt, strict=True)]
         table = average_loadings(
-            self.problem, data.point.tolist(), data.loading.tolist(), data.X, data.Y, ["sample"] * n, [""] * n,
+            self.problem, sequences, data.loading.tolist(), data.X, data.Y, ["sample"] * n, [""] * n,
             [""] * n, failed=[False] * n, provenance={},
         )  # fmt: skip
         return fit_surrogate(table, seed=self.seed)

@@ -106,6 +106,7 @@ class FieldOutcome:
         encoder: PileEncoder,
         gamma: float,
         models: tuple[LandmarkRegressor, ...] = (),
+        skill: dict[str, float] | None = None,
     ) -> None:
         """Make it of fitted models, one per objective; `fit_field_outcome` fits them.
 
@@ -115,7 +116,10 @@ class FieldOutcome:
             encoder: fitted.
             gamma: where the machine enters if that is no variable.
             models: over `join`.
+            skill: by objective, 1 - squared error over that of the mean, of single loadings at held-out design points;
+                at most 0: nothing was learned.
         """
+        self.skill = skill or {}
         self.problem, self.grid, self.encoder, self.gamma, self.models = problem, grid, encoder, gamma, models
 
     def join(self, H: Array, X: Array) -> Array:
@@ -141,16 +145,22 @@ class FieldOutcome:
 def fit_field_outcome(
     data: LoadingData, grid: PileGrid, encoder: PileEncoder, gamma: float, seed: int = 0
 ) -> FieldOutcome:
-    """Return the model fitted to loadings."""
+    """Return the model fitted to loadings, with its skill on held-out design points."""
     blank = FieldOutcome(data.problem, grid, encoder, gamma)
     Z = blank.join(data.before, data.X)
-    models = []
-    for j in range(data.Y.shape[1]):
+    models, skill = [], {}
+    for j, name in enumerate(data.problem.objective_names):
         state = derive_seed(seed, "field", j) % 2**31
         y = tame(data.Y[:, j])
         theta = find_theta(Z, y, _SEARCHED, state)
         models.append(LandmarkRegressor(theta, random_state=state).fit(Z, y))
-    return FieldOutcome(data.problem, grid, encoder, gamma, tuple(models))
+        missed, there = 0.0, 0.0
+        for fit, test in data.iterate_folds(4, seed):
+            held = LandmarkRegressor(theta, random_state=state).fit(Z[fit], y[fit])
+            missed += float(np.sum((y[test] - held.predict(Z[test])) ** 2))
+            there += float(np.sum((y[test] - y[fit].mean()) ** 2))
+        skill[name] = 1.0 - missed / there if there > 0.0 else float("nan")
+    return FieldOutcome(data.problem, grid, encoder, gamma, tuple(models), skill)
 
 
 def tame(y: Array) -> Array:

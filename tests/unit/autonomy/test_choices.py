@@ -248,6 +248,14 @@ def test_a_variable_that_is_called_like_a_strategy_s_and_is_none_is_refused(load
         LoaderModel(replace(loadings, keys=keys))
 
 
+def test_attempts_at_one_point_are_sequences_of_their_own(loadings):
+    """Caught: a point that was tried twice has two loadings of each number, which a table of points refuses."""
+    from dataclasses import replace
+
+    twice = replace(loadings, attempt=loadings.loading // 2, loading=loadings.loading % 2)
+    assert len(LoaderModel(twice).surrogate.models_[0].y_train_) == 2 * 60
+
+
 def test_a_stored_scenario_has_the_same_machine(model):
     model.check_fits(SCENARIO.resolve())
 

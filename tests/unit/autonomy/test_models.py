@@ -4,12 +4,14 @@ Caught: regression with one correlation length for all inputs, worse than a surr
 front that is all but a point, on which a hair of an objective decided.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from drakerock.autonomy.encoding import PileEncoder
 from drakerock.autonomy.entry import calc_entry_features, calc_profiles, choose_slices
-from drakerock.autonomy.outcome_models import BlindOutcome
+from drakerock.autonomy.outcome_models import BlindOutcome, fit_field_outcome
 from drakerock.autonomy.regression import LandmarkRegressor, find_theta
 from drakerock.errors import InputError
 from drakerock.loading.field import HeightField, calc_pile_profile
@@ -115,6 +117,18 @@ def test_who_sees_the_pile_predicts_better(model, unseen):
     blind = calc_error(BlindOutcome(model.surrogate), unseen)
     assert calc_error(model.feature_outcome, unseen)[0] < 0.5 * blind[0]
     assert calc_error(model.field_outcome, unseen)[0] < 0.5 * blind[0]
+
+
+def test_skill_on_held_out_points_is_that_on_unseen_ones(model, unseen):
+    error = calc_error(model.field_outcome, unseen)
+    for value, missed in zip(model.field_outcome.skill.values(), error, strict=True):
+        assert value == pytest.approx(1.0 - missed**2, abs=0.15)
+
+
+def test_loadings_of_noise_have_no_skill(model, loadings):
+    noise = replace(loadings, Y=np.random.default_rng(0).normal(size=loadings.Y.shape))
+    outcome = fit_field_outcome(noise.take(np.arange(120)), model.grid, model.encoder, 0.5)
+    assert max(outcome.skill.values()) < 0.15
 
 
 def test_a_pile_and_its_mirror_image_have_the_same_outcome(model, unseen):
