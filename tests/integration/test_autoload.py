@@ -117,6 +117,25 @@ def test_bounds_that_nothing_keeps_leave_the_machine_where_it_stands(scenario, m
     assert "no strategy of the front satisfies production>=1e+06" in plan.reason
 
 
+def test_a_choice_that_dies_leaves_the_machine_where_it_stands(scenario, model):
+    class Broken:
+        name, sees_pile = "broken", False
+
+        def choose(self, situation, preference):
+            return 1 / 0
+
+    station = make_station(
+        scenario, get_pile(scenario), planner=lambda view: AutonomousLoader(model, Broken(), scenario, view.digger),
+        visible=False,
+    )  # fmt: skip
+    decision, plan, _ = look(station, station.diagram.CreateDefaultContext())
+    assert decision.action == "stop"
+    assert plan.reason == "no strategy could be chosen: ZeroDivisionError: division by zero"
+    outcome = run_cycle(scenario, station.rocks.pile, station=station).outcome
+    assert outcome.reason.startswith("no candidate slice: no strategy could be chosen")
+    assert outcome.bucket_mass_kg == 0.0
+
+
 @pytest.fixture(scope="module")
 def loaded(scenario, model, study, tmp_path_factory):
     """Two loadings in one go, the preference changing between them."""

@@ -101,9 +101,10 @@ class AutonomousLoader(LeafSystem):
                 self._model.problem, self._choice, self._model.robust, situation, preference, strategy,
                 cleaned=self._cleaned,
             )  # fmt: skip
-        except InputError as error:
+        except Exception as error:  # whatever a choice of one's own dies of
             # The machine is safe where it stands; who runs the loading is told.
-            reason = f"no strategy could be chosen: {error}"
+            what = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+            reason = f"no strategy could be chosen: {what}"
             return (
                 Decision("stop", strategy.model_dump(), self._choice.name, False, str(preference), None, (reason,),
                          float("nan"), (), ()),
