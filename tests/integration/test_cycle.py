@@ -13,7 +13,8 @@ from drakerock.loading.plan_file import save_plan
 from drakerock.loading.recording import load_recording, save_recording
 from drakerock.loading.segments import Mode
 from drakerock.loading.signals import calc_signals
-from drakerock.loading.station import make_station
+from drakerock.loading.station import MAX_BACK, make_station
+from drakerock.rocks.drake.interface import find_start_inside
 from drakerock.rocks.drake.plant_engine import PlantRocks
 from drakerock.study.jobs import get_pile
 
@@ -43,8 +44,10 @@ def test_modes_run_in_order_and_the_load_is_weighed(result):
     assert np.all(np.diff(modes) >= 0)
     assert {int(mode) for mode in modes} >= {Mode.APPROACH, Mode.S0, Mode.S1, Mode.S2, Mode.S3, Mode.DONE}
     outcome = result.outcome
-    assert outcome.weighed_mass_kg == pytest.approx(outcome.counted_when_weighed_kg, abs=50)
     performance = result.scenario.loading.performance
+    # A rock that leans on the bucket from outside is weighed, in part, and not counted.
+    tolerance = performance.weighing_tolerance
+    assert outcome.weighed_mass_kg == pytest.approx(outcome.counted_when_weighed_kg, abs=tolerance)
     late = performance.weighing_delay + performance.weighing_time
     assert outcome.sim_time_s >= outcome.waypoint_times_s[4] + late - 1e-9
     changed = [item["mass_kg"] for item in outcome.events if item["event"] == "load changed after s4"]
@@ -254,6 +257,34 @@ def test_station_may_be_a_part_of_a_larger_diagram(small_scenario, pile):
     builder = DiagramBuilder()
     builder.AddSystem(station.diagram)
     assert np.array_equal(initialize(builder.Build()), alone)
+
+
+@pytest.mark.parametrize("engine", ["plant", "nonsmooth"])
+def test_machine_starts_behind_a_loose_rock_that_lies_in_its_place(small_scenario, pile, engine):
+    scenario = use_engine(small_scenario, engine)
+
+    def start(pile):
+        station = make_station(scenario, pile)
+        simulator = Simulator(station.diagram)
+        root = simulator.get_mutable_context()
+        station.initialize(root)
+        simulator.Initialize()
+        plant = station.plant
+        X_WB = plant.EvalBodyPoseInWorld(
+            plant.GetMyContextFromRoot(root), plant.GetBodyByName("bucket", station.machine.instance)
+        )
+        contacts = station.rocks.GetOutputPort("contacts").Eval(station.rocks.GetMyContextFromRoot(root))
+        plan = station.diagram.GetOutputPort("plan").Eval(root)
+        return X_WB.translation(), plan.waypoint_x[0] - scenario.loading.planning.run_up, contacts
+
+    p_WB, tip_x, _ = start(pile)
+    smallest = pile.select(np.array([int(np.argmin(pile.size))]))
+    lying = replace(smallest, p_WRs=np.array([[tip_x, p_WB[1], 0.5 * smallest.size[0]]]), contacts=None)
+    blocked = pile.join(lying)
+    p_WB_blocked, _, contacts = start(blocked)
+    assert p_WB_blocked[1] == p_WB[1]
+    assert p_WB[0] - MAX_BACK < p_WB_blocked[0] < p_WB[0]
+    assert find_start_inside(contacts, blocked.size) is None
 
 
 def test_context_can_be_saved_and_repeated(small_scenario, pile):

@@ -19,6 +19,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
+from drakerock.errors import SimulationFailure
 from drakerock.lhd.geometry import collision_pieces, make_bucket_geometry
 from drakerock.lhd.hinge import add_hinge_moment
 from drakerock.lhd.kinematics import make_kinematics
@@ -40,7 +41,7 @@ from drakerock.loading.sensing import PileSensor
 from drakerock.loading.steering import LineSteering
 from drakerock.memory import get_own_context
 from drakerock.rocks.drake.drift import AddDrift
-from drakerock.rocks.drake.interface import RockSystem
+from drakerock.rocks.drake.interface import RockSystem, find_start_inside
 from drakerock.rocks.drake.plant import add_plant
 from drakerock.rocks.drake.plant_engine import AddRockBodies
 from drakerock.rocks.shapes import RockShape, load_rock_shapes
@@ -48,6 +49,9 @@ from drakerock.rocks.site import Site, make_site
 from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
+
+# Where a loose rock lies in the machine's place, it starts so much farther back, at most so far [m].
+BACK_STEP, MAX_BACK = 0.25, 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +112,7 @@ class Station:
         field: HeightField = self.diagram.GetOutputPort("height_field").Eval(context)
         plan = self.diagram.GetOutputPort("plan").Eval(context)
         if isinstance(plan, DigPlan):
-            self._place(root_context, x_tip=float(plan.waypoint_x[0]) - loading.planning.run_up, y=plan.y)
+            self._place_clear(root_context, float(plan.waypoint_x[0]) - loading.planning.run_up, plan.y)
         return field
 
     def read_strategy(self, root_context: Context) -> dict[str, float]:
@@ -134,6 +138,22 @@ class Station:
         self._place(root_context, x_tip=-self.scenario.loading.sensing.scanner.distance, y=0.0)
         front = self.plant.GetBodyByName("front_unit", self.machine.instance)
         return self.plant.EvalBodyPoseInWorld(self.plant.GetMyContextFromRoot(root_context), front)
+
+    def _place_clear(self, root_context: Context, x_tip: float, y: float) -> None:
+        """Place the machine, farther back than `x_tip` if rocks lie there, off the pile or in front of its other parts.
+
+        Raises:
+            InputError: the machine cannot reach that pose.
+        """
+        rocks = self.rocks.GetMyContextFromRoot(root_context)
+        for back in np.arange(0.0, MAX_BACK, BACK_STEP):
+            self._place(root_context, x_tip=x_tip - back, y=y)
+            try:
+                contacts = self.rocks.GetOutputPort("contacts").Eval(rocks)
+            except SimulationFailure:
+                return  # of the rocks; the simulation will tell, too
+            if find_start_inside(contacts, self.rocks.pile.size) is None:
+                return
 
     def _place(self, root_context: Context, x_tip: float, y: float) -> None:
         set_machine_pose(

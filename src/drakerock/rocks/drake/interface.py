@@ -63,6 +63,23 @@ class RockContacts:
         return len(self.rock)
 
 
+# A body of the plant that starts so deep in a rock starts inside the pile: [m], and as a share of the rock's size.
+START_PENETRATION = 0.05
+START_SHARE = 1 / 6
+
+
+def find_start_inside(contacts: RockContacts, size: Array) -> int | None:
+    """Return the contact at which a body of the plant starts inside the pile; None if all start outside.
+
+    Args:
+        contacts: of the first step.
+        size: (n,) of the rocks [m].
+    """
+    allowed = np.minimum(START_PENETRATION, START_SHARE * size[contacts.rock])
+    excess = np.where(contacts.body > 0, contacts.depth - allowed, -np.inf)
+    return int(np.argmax(excess)) if len(excess) and excess.max() > 0.0 else None
+
+
 def make_empty_contacts() -> RockContacts:
     """Return no contact points."""
     none, points = np.zeros(0, np.int64), np.zeros((0, 3))

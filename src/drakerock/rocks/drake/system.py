@@ -25,7 +25,13 @@ from pydrake.systems.framework import (
 from drakerock.errors import InputError
 from drakerock.memory import weak
 from drakerock.rocks.drake.geometry import PlantGeometry
-from drakerock.rocks.drake.interface import ROCK_SUMMARY, RockContacts, RockSystem, make_empty_contacts
+from drakerock.rocks.drake.interface import (
+    ROCK_SUMMARY,
+    RockContacts,
+    RockSystem,
+    find_start_inside,
+    make_empty_contacts,
+)
 from drakerock.rocks.drake.states import RockStates, SolvedState
 from drakerock.rocks.engine.engine import (
     MachineStep,
@@ -38,10 +44,6 @@ from drakerock.rocks.shapes import RockShape
 from drakerock.rocks.state import PileState
 
 Array = NDArray[np.float64]
-
-# A body of the plant that starts so deep in a rock starts inside the pile: [m], and as a share of the rock's size.
-START_PENETRATION = 0.05
-START_SHARE = 1 / 6
 
 
 class NonsmoothRocks(RockSystem):
@@ -86,6 +88,7 @@ class NonsmoothRocks(RockSystem):
         super().__init__(plant, pile, shapes, geometry.bodies)
         self._engine = engine
         self._provenance = dict(pile.provenance)
+        self._default_state = SolvedState(engine.make_arrays(pile))
         self._states = self.DeclareAbstractState(Value[object](self._make_states(pile)))
         # The state's number, and what the step that led to it told.
         self._number = self.DeclareDiscreteState(1)
@@ -161,6 +164,8 @@ class NonsmoothRocks(RockSystem):
         return report
 
     def _make_states(self, pile: PileState) -> RockStates:
+        if pile is self._default_pile:
+            return RockStates(self._engine, self._default_state)
         return RockStates(self._engine, SolvedState(self._engine.make_arrays(pile)))
 
     def _get_states(self, context: Context) -> tuple[RockStates, int]:
@@ -212,11 +217,9 @@ class NonsmoothRocks(RockSystem):
         discrete.set_value(self._report, np.concatenate([summary, report.F_Bs_W.reshape(-1)]))
 
     def _check_start(self, context: Context) -> EventStatus:
-        found = self._find_contacts(context)
-        allowed = np.minimum(START_PENETRATION, START_SHARE * self._default_pile.size[found.rock])
-        excess = np.where(found.body > 0, found.depth - allowed, -np.inf)
-        if len(found) and excess.max() > 0.0:
-            k = int(np.argmax(excess))
+        found: RockContacts = self.GetOutputPort("contacts").Eval(context)
+        k = find_start_inside(found, self._default_pile.size)
+        if k is not None:
             body = self._plant.get_body(BodyIndex(int(found.body[k])))
             raise InputError(
                 f"body '{body.scoped_name()}' starts {found.depth[k]:.2f} m inside a rock at "

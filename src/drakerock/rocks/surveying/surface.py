@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import distance_transform_edt, label
-from scipy.stats import binned_statistic_2d
 
 from drakerock.errors import InputError
 from drakerock.rocks.config import PileConfig, ScanConfig, SiteConfig
@@ -68,6 +67,8 @@ def make_surface(
     Raises:
         InputError: too few cells with points, or a hole that is too wide.
     """
+    from scipy.stats import binned_statistic_2d  # takes long to import, and only scans need it
+
     cell, notes = scan.cell, list[str]()
     reach = float(points[:, 0].min()) - 1.0
     first = max(int(np.ceil(min(-reach, site.drift_length) / cell)), 1)

@@ -8,6 +8,7 @@ rounded. Cores of touching rocks are apart, so that distance and normal are well
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,8 @@ MAX_INSET = 4.0
 MIN_SINGULAR_VALUE = 1e-3
 # Triangles whose planes differ by less are one face [size of the shape, 1 m at least].
 SAME_PLANE = 1e-6
+# Cores that are kept, for further engines of the same shapes.
+CORES = 512
 
 
 class ConvexShapes(NamedTuple):
@@ -79,7 +82,10 @@ def make_convex_shapes(vertices: Sequence[Array], roundings: Sequence[float]) ->
     Raises:
         ValueError: points that span no volume, or a rounding that leaves no core.
     """
-    lists = [_make_core(np.asarray(points, float), r) for points, r in zip(vertices, roundings, strict=True)]
+    lists = [
+        _make_core(np.ascontiguousarray(points, float).tobytes(), r)
+        for points, r in zip(vertices, roundings, strict=True)
+    ]
     vertex_start = _make_starts([len(core) for core, _, _ in lists])
     face_start = _make_starts([len(faces) for _, faces, _ in lists])
     face_lists = [face + vertex_start[k] for k, (_, faces, _) in enumerate(lists) for face in faces]
@@ -121,9 +127,13 @@ def make_convex_shapes(vertices: Sequence[Array], roundings: Sequence[float]) ->
     )
 
 
-def _make_core(points: Array, rounding: float) -> tuple[Array, list[IntArray], Array]:
-    """Return the core's corners, its faces as lists of corners, and the faces' normals."""
-    corners, faces, normals = _find_faces(points)
+@lru_cache(maxsize=CORES)
+def _make_core(points: bytes, rounding: float) -> tuple[Array, list[IntArray], Array]:
+    """Return the core's corners, its faces as lists of corners, and the faces' normals; none is to be changed.
+
+    A loading makes several engines of the same shapes, a study thousands.
+    """
+    corners, faces, normals = _find_faces(np.frombuffer(points).reshape(-1, 3))
     if rounding == 0.0:
         return corners, faces, normals
     # Every corner moves inwards until the planes that meet there have moved by the rounding. Where more than
