@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from drakerock import terminal
+from drakerock.cli_autoload import autoload
 from drakerock.cli_new import new_app
 from drakerock.errors import InputError, RunStopped, SimulationFailure
 from drakerock.logs import show_only_ours
@@ -392,6 +393,7 @@ def machine_show(
     terminal.print_paths([path])
 
 
+app.command()(autoload)
 app.add_typer(new_app, name="new")
 study_app = typer.Typer(no_args_is_help=True, help="Campaigns: many sequences of loadings, stored.")
 app.add_typer(study_app, name="study")

@@ -198,6 +198,31 @@ def print_sequence(summary: dict[str, Any]) -> None:
     get_output().print(f"events: {events}", soft_wrap=True)
 
 
+def print_autoload(summary: dict[str, Any]) -> None:
+    """Print what a sequence of autonomous loadings came to: a row a loading, and the mean."""
+    from rich.table import Table
+
+    kinds = (
+        f"{summary['fell_back']} fell back, {summary['cleaned']} cleaned first, {summary['failed']} failed"
+    )
+    table = Table(
+        title=f"{summary['loadings']} loadings by {summary['choice']}: {kinds}", title_justify="left"
+    )
+    strategy, objectives = ("alpha", "beta", "gamma", "kappa"), ("production", "damage", "debris")
+    units = {"production": "kg/s", "debris": "kg"}
+    for name in ("loading", *strategy, *(f"{name} {units.get(name, '')}".strip() for name in objectives)):
+        table.add_column(name, justify="right")
+    for number, decision in enumerate(summary["decisions"]):
+        values = [f"{decision['strategy'][name]:.2f}" for name in strategy]
+        came = [summary["quantities"][name]["values"][number] for name in objectives]
+        shown = ["-" if value is None else f"{value:.4g}" for value in came]
+        table.add_row(f"{number + 1}", *values, *shown)
+    means = [summary["quantities"][name]["mean"] for name in objectives]
+    table.add_section()
+    table.add_row("mean", "", "", "", "", *("-" if value is None else f"{value:.4g}" for value in means))
+    get_output().print(table)
+
+
 def print_calibration(result: dict[str, Any]) -> None:
     """Print what `run_calibration` found: values with intervals."""
     from rich.table import Table

@@ -104,13 +104,24 @@ def test_controller_and_machine_parameters_act_on_a_real_study(tmp_path):
         assert outcome["scenario_hash"] == calc_config_hash(scenario)
 
 
-@pytest.mark.parametrize("name", ["smoke", "reduced", "full_size", "paper", "control_parameters"])
+@pytest.mark.parametrize(
+    "name",
+    ["smoke", "reduced", "full_size", "paper", "control_parameters", "loading_control", "slip_control"],
+)
 def test_shipped_studies_can_be_read(name):
     study = load_study(find_data("studies", f"{name}.yaml"))
     sampling = study.exploration.sampling
     n_cycles = (sampling.n_samples + sampling.n_validation) * study.loadings
     assert (
         n_cycles
-        == {"smoke": 10, "reduced": 760, "full_size": 1560, "paper": 4880, "control_parameters": 290}[name]
+        == {
+            "smoke": 10,
+            "reduced": 760,
+            "full_size": 1560,
+            "paper": 4880,
+            "control_parameters": 290,
+            "loading_control": 200,
+            "slip_control": 200,
+        }[name]
     )
     assert find_data("studies", f"{name}.py").exists()

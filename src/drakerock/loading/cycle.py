@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -139,6 +139,7 @@ def run_cycle(
         wall_time=clock.perf_counter() - start[0],
         cpu_time=clock.process_time() - start[1],
     )
+    outcome = replace(outcome, strategy=station.read_strategy(root))
     return CycleResult(
         outcome, scenario, pile, pile_after, in_bucket, debris, field,
         None if failure else look_down(

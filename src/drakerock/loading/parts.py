@@ -101,16 +101,23 @@ def load_function(name: str, where: str) -> MakePart:
     return found
 
 
+OPEN_INPUTS = {"planner": ("preference",)}
+"""Input ports that a part may have and the station has no signal for: they become input ports of its Diagram."""
+
+
 def connect_inputs(
     builder: DiagramBuilder, role: str, part: System, signals: Mapping[str, OutputPort]
 ) -> None:
-    """Connect each of a part's input ports to the signal of its name.
+    """Connect each of a part's input ports to the signal of its name; those of `OPEN_INPUTS` are exported.
 
     Raises:
         InputError: a port of a name that the station has no signal for.
     """
     for k in range(part.num_input_ports()):
         port = part.get_input_port(k)
+        if port.get_name() in OPEN_INPUTS.get(role, ()):
+            builder.ExportInput(port, port.get_name())
+            continue
         source = signals.get(port.get_name())
         if source is None:
             raise InputError(

@@ -11,7 +11,7 @@ from drakerock.errors import InputError, SimulationFailure
 from drakerock.files import make_folder
 from drakerock.identity import calc_config_hash, get_versions
 from drakerock.loading.cost import Meter
-from drakerock.loading.cycle import CycleResult, run_cycle, save_cycle
+from drakerock.loading.cycle import CycleResult, Progress, run_cycle, save_cycle
 from drakerock.loading.folder import NEXT_PILE, OUTCOME
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.scenario import Scenario, make_recipe
@@ -24,6 +24,8 @@ from drakerock.rocks.state import PileState, load_pile, save_pile
 
 SequenceProgress = Callable[[int, str, float], None]
 """Called with the loading's number, what is being done, and the simulated time [s]."""
+Load = Callable[[Scenario, PileState, int, Path, Progress], CycleResult]
+"""Runs one loading, given the pile it starts from, its number and its folder; default: `run_cycle`."""
 
 
 def run_sequence(
@@ -33,6 +35,7 @@ def run_sequence(
     *,
     progress: SequenceProgress | None = None,
     finished: Callable[[Path], None] | None = None,
+    load: Load | None = None,
 ) -> list[CycleOutcome]:
     """Run loadings from the scenario's pile: weigh, clean, refill, relax, sense and plan anew.
 
@@ -47,6 +50,7 @@ def run_sequence(
         folder: where the loadings' subfolders are.
         progress: called as things proceed.
         finished: called with each loading's subfolder once it is complete, also if it was before.
+        load: what runs one loading in place of `run_cycle`; what it depends on beside the scenario is its own care.
 
     Returns:
         The outcomes, fewer than `n_loadings` after a failure.
@@ -65,7 +69,7 @@ def run_sequence(
         if outcome is None:
             if pile is None:
                 pile = _read_pile(scenario, folder, number)
-            outcome, pile = _run_loading(scenario, pile, number, place, progress)
+            outcome, pile = _run_loading(scenario, pile, number, place, progress, load)
         outcomes.append(outcome)
         if finished:
             finished(place)
@@ -108,14 +112,23 @@ def _show(versions: dict[str, str]) -> str:
 
 
 def _run_loading(
-    scenario: Scenario, pile: PileState, number: int, place: Path, progress: SequenceProgress | None
+    scenario: Scenario,
+    pile: PileState,
+    number: int,
+    place: Path,
+    progress: SequenceProgress | None,
+    load: Load | None,
 ) -> tuple[CycleOutcome, PileState]:
     def tell(stage: str, time: float) -> None:
         if progress:
             progress(number, stage, time)
 
     meter = Meter()
-    result = run_cycle(scenario, pile, lambda mode, time: tell(mode.lower(), time))
+
+    def advance(mode: str, time: float) -> None:
+        tell(mode.lower(), time)
+
+    result = load(scenario, pile, number, place, advance) if load else run_cycle(scenario, pile, advance)
     free_diagrams()
     tell("refill", result.outcome.sim_time_s)
     following = make_next_pile(scenario, result, number)

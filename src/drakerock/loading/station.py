@@ -115,6 +115,19 @@ class Station:
             self._place_clear(root_context, float(plan.waypoint_x[0]) - loading.planning.run_up, plan.y)
         return field
 
+    def read_strategy(self, root_context: Context) -> dict[str, float]:
+        """Return the strategy that is planned: the planner's, if it has an output port ``strategy``, or the scenario's.
+
+        Args:
+            root_context: an initialised one.
+        """
+        strategy: dict[str, float] = self.scenario.loading.strategy.model_dump()
+        if not self.planner.HasOutputPort("strategy"):
+            return strategy
+        context = self.planner.GetMyContextFromRoot(root_context)
+        values = self.planner.GetOutputPort("strategy").Eval(context)
+        return dict(zip(strategy, map(float, values), strict=True))
+
     def find_scanning_pose(self) -> RigidTransform:
         """Return the pose X_WF of the front unit, which carries the scanner, while the machine looks at the pile.
 
@@ -172,7 +185,8 @@ def make_station(
         controller, planner, sensor: make a part from a `StationView` (see `drakerock.loading.parts`); default: what the
             scenario names in `loading.parts`, or ours. Their input ports are connected by name to the station's
             signals: measurement, plan, height_field, mode, progress, bucket_force, hinge_moment, pile, body_poses,
-            body_spatial_velocities, machine_state, geometry_query, rock_summary.
+            body_spatial_velocities, machine_state, geometry_query, rock_summary. A planner's input port ``preference``
+            becomes one of the Diagram's. A planner that chooses the strategy tells it at an output port ``strategy``.
         visible: show rocks to SceneGraph, for Meshcat and cameras.
         extend: called with the builder before the Diagram is built, to add what else is wanted (a visualizer).
 

@@ -1,0 +1,1 @@
+"""The autonomous loader: the pile decides, the model advises."""
