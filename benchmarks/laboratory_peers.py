@@ -94,7 +94,8 @@ class RapierRig:
     def _add_rock(self, k: int) -> object:
         pile, material = self.pile, self.material
         turn = Rotation.from_quat(pile.q_WRs[k], scalar_first=True).as_rotvec()
-        body = rapier.RigidBody.dynamic(
+        make = rapier.RigidBody.fixed if pile.fixed[k] else rapier.RigidBody.dynamic
+        body = make(
             translation=tuple(map(float, pile.p_WRs[k])),
             rotation=tuple(map(float, turn)),
             linvel=tuple(map(float, pile.V_WRs[k, 3:])),

@@ -1,7 +1,8 @@
 """A plate of 30 t pushed into a small pile with 80 kN, by variants of both engines: python benchmarks/plate_push.py
 
-What is displaced differed between engines; the finer solution tells which is right. Needed: pip install rapier3d. Runs
-are added to a file of lines, and skipped if stored.
+What is displaced differed between engines; the finer solution tells which is right. `--bench full`: a plate of 60 t and
+300 kN in the shipped pile of 5 770 rocks, between boxes for the drift's and the void's walls. Needed: pip install
+rapier3d. Runs are added to a file of lines, and skipped if stored.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import rapier3d as rapier
 from laboratory_peers import RapierRig
 from scipy.stats import t as student
 
-from drakerock.laboratory.beds import Bin, calc_profile, fit_slope, make_bin
+from drakerock.laboratory.beds import calc_profile, fit_slope, make_bin
 from drakerock.laboratory.material import Material, make_material
 from drakerock.laboratory.repose import make_slope
 from drakerock.laboratory.rig import DrakeRig
@@ -26,13 +27,29 @@ from drakerock.laboratory.scene import Mover, Scene, Slab
 from drakerock.loading.scenario import load_scenario
 from drakerock.randomness import derive_seed
 from drakerock.rocks.state import PileState, load_pile, save_pile
+from drakerock.study.jobs import get_pile as get_scenario_pile
 
-# Less than a plate of 60 t and 300 kN: the pile is small [kg, N], times [s].
-MASS, FORCE, RELAXING, PUSHING, RESTING = 30e3, 80e3, 1.0, 2.5, 0.5
+# Times [s].
+RELAXING, PUSHING, RESTING = 1.0, 2.5, 0.5
 THRESHOLDS = (0.01, 0.02, 0.05, 0.1, 0.2)
 ROCKS = 400
 # Of the plate, its edge forward, on the floor [m].
-WIDTH, THICKNESS, LENGTH, GAP = 1.4, 0.1, 6.0, 0.03
+THICKNESS, LENGTH, GAP = 0.1, 6.0, 0.03
+# Thickness of the full bench's walls, and of the rock above the brow [m].
+WALL, FACE = 2.0, 0.3
+
+
+@dataclass(frozen=True)
+class Push:
+    """A plate's width [m] and mass [kg], and the force on it [N]."""
+
+    width: float
+    mass: float
+    force: float
+
+
+# The small pile bears less.
+PUSHES = {"small": Push(1.4, 30e3, 80e3), "full": Push(2.7, 60e3, 300e3)}
 NONE = "dynamics.nonsmooth.reduction=none"
 # Name: settings of the scenario, for the nonsmooth engine.
 OURS = {
@@ -48,6 +65,9 @@ OURS = {
         NONE, "dynamics.time_step=0.001", "dynamics.nonsmooth.iterations=200",
     ),
     "sharp": (NONE, "dynamics.nonsmooth.rounding=0.002"),
+    "sharp, one point per pair": (
+        NONE, "dynamics.nonsmooth.rounding=0.002", "dynamics.nonsmooth.manifold_points=1",
+    ),
     "no spin damping": (NONE, "dynamics.nonsmooth.spin_damping=0"),
     "one point per pair": (NONE, "dynamics.nonsmooth.manifold_points=1"),
 }  # fmt: skip
@@ -93,15 +113,11 @@ def get_pile(seed: int, material: Material, folder: Path) -> PileState:
 
 @dataclass(frozen=True)
 class Start:
-    """A pile without the single rocks before it, where it begins, and its bench."""
+    """A pile without the single rocks before it, where it begins, and the walls around it."""
 
     pile: PileState
     toe: float
-    room: Bin
-    material: Material
-
-    def make_scene(self, mover: Mover) -> Scene:
-        return Scene(self.room.make_walls("flre", 0.0, 4.0 * self.room.height), (mover,))
+    walls: tuple[Slab, ...]
 
 
 def make_start(seed: int, folder: Path) -> Start:
@@ -114,7 +130,33 @@ def make_start(seed: int, folder: Path) -> Start:
     slope, offset = fit_slope(x, calc_profile(pile, material, x, 0.4 * room.width))
     toe = -offset / slope
     pile = pile.select(pile.p_WRs[:, 0] > toe - 0.5 * d)
-    return Start(pile, toe, room, material)
+    return Start(pile, toe, room.make_walls("flre", 0.0, 4.0 * room.height))
+
+
+def make_full_start() -> Start:
+    """Return the shipped pile; its curved roof is a box at the crown's height."""
+    scenario = load_scenario(None, ())
+    site, material = scenario.site, make_material(scenario.rocks, scenario.dynamics)
+    pile = get_scenario_pile(scenario)
+    x = np.arange(-8.0, 0.0, 0.25 * material.mean_size)
+    slope, offset = fit_slope(x, calc_profile(pile, material, x, 1.5))
+    toe = -offset / slope
+    pile = pile.select(pile.fixed | (pile.p_WRs[:, 0] > toe - 0.5 * material.mean_size))
+    length, height, middle = site.void_depth + 20.0, site.void_height, 0.5 * (site.void_depth - 20.0)
+    width, top, lean = site.drift_width, site.drift_height, np.deg2rad(site.wall_lean_deg)
+    # The middle of the face above the brow, and out of the rock's side of it.
+    up, out = np.array([-np.sin(lean), 0.0, np.cos(lean)]), np.array([np.cos(lean), 0.0, np.sin(lean)])
+    face = np.array([0.0, 0.0, top]) + 0.5 * (height * up - FACE * out)
+    friction = 2.0 / (1.0 / site.friction + 1.0 / scenario.rocks.friction)
+    walls = (
+        Slab((length, width + 2.0 * WALL, WALL), (middle, 0.0, -0.5 * WALL), friction=friction),
+        *(Slab((length, WALL, height), (middle, side * 0.5 * (width + WALL), 0.5 * height), friction=friction)
+          for side in (-1.0, 1.0)),
+        Slab((WALL, width, height), (site.void_depth + 0.5 * WALL, 0.0, 0.5 * height), friction=friction),
+        Slab((20.0, width, FACE), (-10.0 - FACE, 0.0, top + 0.5 * FACE), friction=friction),
+        Slab((FACE, width, height), tuple(face), -lean, friction),
+    )  # fmt: skip
+    return Start(pile, toe, walls)
 
 
 def make_variant(name: str) -> Material:
@@ -122,19 +164,22 @@ def make_variant(name: str) -> Material:
     return make_material(scenario.rocks, scenario.dynamics)
 
 
-def run(name: str, seed: int, folder: Path) -> dict[str, float]:
-    begin = make_start(seed, folder)
-    pile, toe, material = begin.pile, begin.toe, make_variant(name)
-    start = float(np.min(pile.p_WRs[:, 0] - 0.8 * pile.size)) - 0.2
-    plate = Slab((LENGTH, WIDTH, THICKNESS), (start - 0.5 * LENGTH, 0.0, GAP + 0.5 * THICKNESS), friction=0.4)
-    mover = Mover("plate", (plate,), (1.0, 0.0, 0.0), drive="force", mass=MASS)
+def run(name: str, bench: str, seed: int, folder: Path) -> dict[str, float]:
+    begin = make_full_start() if bench == "full" else make_start(seed, folder)
+    pile, toe, material, push = begin.pile, begin.toe, make_variant(name), PUSHES[bench]
+    ahead = pile.p_WRs[:, 2] < 1.0
+    start = float(np.min((pile.p_WRs[:, 0] - 0.8 * pile.size)[ahead])) - 0.2
+    plate = Slab(
+        (LENGTH, push.width, THICKNESS), (start - 0.5 * LENGTH, 0.0, GAP + 0.5 * THICKNESS), friction=0.4
+    )
+    mover = Mover("plate", (plate,), (1.0, 0.0, 0.0), drive="force", mass=push.mass)
     cpu = time.process_time()
-    rig = make_rig(name, begin.make_scene(mover), pile, material)
+    rig = make_rig(name, Scene(begin.walls, (mover,)), pile, material)
     rig.advance(RELAXING)
     before = rig.get_pile().p_WRs
-    record = rig.advance(PUSHING, {"plate": FORCE})
+    record = rig.advance(PUSHING, {"plate": push.force})
     pushed = rig.get_pile().p_WRs
-    rig.advance(RESTING, {"plate": FORCE})
+    rig.advance(RESTING, {"plate": push.force})
     after = rig.get_pile().p_WRs
     volumes = material.calc_volumes(pile)
 
@@ -168,18 +213,19 @@ COLUMNS = (
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--variants", nargs="+", choices=[*OURS, *THEIRS], default=[*OURS, *THEIRS])
-    parser.add_argument("--piles", type=int, default=4)
+    parser.add_argument("--bench", choices=list(PUSHES), default="small")
+    parser.add_argument("--piles", type=int, default=4, help="of the small bench")
     parser.add_argument("--out", type=Path, default=Path("build/plate_push"))
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
-    path = options.out / "force.jsonl"
+    path = options.out / ("force.jsonl" if options.bench == "small" else "force_full.jsonl")
     lines = path.read_text().splitlines() if path.exists() else []
     stored = {(one["variant"], one["pile"]): one for one in map(json.loads, lines)}
-    for seed in range(options.piles):
+    for seed in range(options.piles if options.bench == "small" else 1):
         for name in options.variants:
             if (name, seed) in stored:
                 continue
-            found = {k: round(v, 4) for k, v in run(name, seed, options.out).items()}
+            found = {k: round(v, 4) for k, v in run(name, options.bench, seed, options.out).items()}
             stored[name, seed] = {"variant": name, "pile": seed, **found}
             with open(path, "a", encoding="utf-8") as file:
                 file.write(json.dumps(stored[name, seed]) + "\n")

@@ -54,9 +54,9 @@ def test_plough_pushes_rocks_with_a_force_in_balance(load, tmp_path):
     assert page.stat().st_size > 1e6
 
 
-def test_excavator_lifts_rocks_out_of_the_heap(load):
-    # 82 to 134 kg in the digs that were tried; a dig differs from processor to processor by its rounding.
-    assert 40.0 < load("excavator").main() < 800.0
+def test_excavator_fills_its_bucket(load):
+    # It holds some 550 kg level. Four heaps gave 437 to 657 kg; a dig differs from processor to processor.
+    assert 275.0 < load("excavator").main() < 1000.0
 
 
 def test_robot_arm_lifts_the_rock_that_the_camera_sees(load):
