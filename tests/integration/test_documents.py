@@ -34,6 +34,7 @@ from drakerock.study.runner import run_study
 from drakerock.study.schema import StudyConfig, load_study
 from drakerock.viewing import report
 from report_helpers import save_confirmation
+from tests.autonomy_study import make_study
 from tests.browsers import find_fault
 from tests.conftest import make_heap
 from tests.cycle_files import make_recording, write_cycle
@@ -52,6 +53,10 @@ NOT_RUN = {
         "docs/machine.md",
         "src/drakerock/models/lhd/design.yaml   shapes, pins, masses, stops: what one edits",
     ): ("a list of files; test_paths_that_documents_name_are_there looks for them"),
+    (
+        "docs/autonomy.md",
+        "nice python benchmarks/autonomy.py run out/full_size --out out/autonomy --loadings 15",
+    ): "a day of CPU time; tests/unit/autonomy/test_benchmark.py runs the parts of it",
     ("docs/validation/motors.md", "for d in 1e7 1e8 1e9 1e10; do for s in 1 2 3; do"): (
         "a loop of twelve loadings; test_the_commands_in_the_documentation_are_valid reads its command"
     ),
@@ -75,6 +80,7 @@ SHORTER = {
         *("--set", "rocks.gradation=[{size_m: 0.3, mass_fraction: 1.0}]"),
         *("--with", "rocks=60", "--repeats", "1"),
     ],
+    "autoload": ["--choice", "best_fixed", "--cycles", "1", "--no-replay"],
     "film": ["--fps", "1", "--speed", "4", "--size", "240x160"],
 }
 
@@ -159,6 +165,8 @@ def run_shell(block: Block, run: Run) -> None:
         match words:
             case []:
                 continue
+            case ["drakerock", "study", "run", "studies/reduced.yaml", *_]:
+                continue  # that is the study in miniature here
             case ["drakerock", "film", *_] if find_fault():
                 continue  # without a browser; tests/unit/viewing/test_pages.py says so
             case ["drakerock", *rest]:
@@ -202,6 +210,8 @@ def check_yaml(block: Block) -> None:
 @pytest.mark.parametrize("document", WITH_BLOCKS)
 def test_blocks_run(document, place, cheap, run_command, plan, shapes):
     names: dict[str, object] = {"__name__": "__main__"}
+    if document in {"README.md", "docs/autonomy.md"}:
+        make_study(scenario_module.load_scenario("studies/small.yaml"), Path("out/reduced"))
     if document == "docs/data.md":
         run_study(load_study("studies/smoke.yaml", ["executor.kind=serial"]), Path("out/smoke"))
     if document == "docs/replay.md":
