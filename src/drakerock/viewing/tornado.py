@@ -28,17 +28,22 @@ def draw_tornado(ax: Axes, effects: Sequence[Effect], objective: Objective, desc
     """
     ranked = sorted(effects, key=lambda effect: effect.size)
     for row, effect in enumerate(ranked):
-        for value, change, error in zip(effect.values[1:], effect.changes, effect.errors, strict=True):
+        # A bar each, side by side: changes often go the same way.
+        height = 0.8 / max(len(effect.changes), 1)
+        for k, (value, change, error) in enumerate(
+            zip(effect.values[1:], effect.changes, effect.errors, strict=True)
+        ):
             below = value < effect.values[0]
+            place = row - 0.4 + (k + 0.5) * height
             if not np.isfinite(change):
-                ax.text(effect.centre, row, " no result", va="center", fontsize=7, color="0.5")
+                ax.text(effect.centre, place, " no result", va="center", fontsize=7, color="0.5")
                 continue
             ax.barh(
-                row, change, left=effect.centre, height=0.7, color="C0" if below else "C1", alpha=0.85,
+                place, change, left=effect.centre, height=0.9 * height, color="C0" if below else "C1", alpha=0.85,
                 xerr=error if np.isfinite(error) else None, ecolor="0.3",
             )  # fmt: skip
             ax.annotate(
-                describe(effect.variable, value), (effect.centre + change, row), fontsize=7, va="center",
+                describe(effect.variable, value), (effect.centre + change, place), fontsize=7, va="bottom",
                 ha="left" if change >= 0 else "right", xytext=(3 if change >= 0 else -3, 0),
                 textcoords="offset points",
             )  # fmt: skip
