@@ -22,13 +22,13 @@ from drakerock.study.jobs import get_pile
 from drakerock.study.schema import load_study
 
 STUDY = Path(__file__).parents[1] / "studies" / "calibration.yaml"
-PLANTED = {"density": 2650.0, "damping": 3.0e7}
+PLANTED = {"density": 2650.0, "stall_torque": 1.62e5}
 # Standard deviations of the measured values, as the study states them.
-ANGLE, TORQUE, FORCE = 0.002, 5e3, 5e3
+SPEED, TORQUE, FORCE = 0.02, 5e3, 5e3
 
 
 def measure(study, path):
-    """Write the measurement: boom angle [deg] and torque [kN m] over time [ms], push force [kN] over place [m]."""
+    """Write the measurement: speed [km/h] and boom torque [kN m] over time [ms], push force [kN] over place [m]."""
     scenario = study.make_scenario(np.array([PLANTED[v.name] for v in study.variables]), "planted")
     signals = run_cycle(scenario, get_pile(scenario)).signals
     rng = np.random.default_rng(11)
@@ -39,7 +39,7 @@ def measure(study, path):
     noise = rng.normal(size=(3, len(rows)))
     columns = {
         "t [ms]": 1e3 * signals["time"][rows],
-        "boom angle [deg]": np.rad2deg(signals["phi_l"][rows] + ANGLE * noise[0]),
+        "speed [km/h]": 3.6 * (signals["v_F"][rows] + SPEED * noise[0]),
         "boom torque [kNm]": 1e-3 * (signals["torque_boom"][rows] + TORQUE * noise[1]),
         "tip [m]": signals["x_T"][rows],
         "push force [kN]": 1e-3 * (signals["bucket_force_x"][rows] + FORCE * noise[2]),

@@ -1,4 +1,4 @@
-"""A stand-in for the simulation whose curves are known functions of density and friction."""
+"""A stand-in for the simulation whose curves are known functions of density, friction and the wheels' stall torque."""
 
 from __future__ import annotations
 
@@ -17,6 +17,10 @@ def calc_curves(density, friction, time):
     return angle, force
 
 
+def calc_speed(stall_torque, time):
+    return 1.3 * (1 - np.exp(-5.0 * stall_torque / 1.9e5 * time))
+
+
 def run(scenario, n_loadings, folder, *, progress=None):
     RUNS.append(str(folder))
     outcomes = study_work.run(scenario, n_loadings, folder, progress=progress)
@@ -26,7 +30,8 @@ def run(scenario, n_loadings, folder, *, progress=None):
     force = force * (1 + 0.02 * make_generator(scenario.seed, "scatter").normal())
     columns = {"time": time, "phi_l": angle, "bucket_force_x": force, "x_T": -3.0 + 0.4 * time}
     columns["torque_boom"] = 2.0 * force
-    units = {"time": "s", "phi_l": "rad", "bucket_force_x": "N", "x_T": "m", "torque_boom": "N m"}
+    columns["v_F"] = calc_speed(scenario.machine.wheel.effort or 1.9e5, time)
+    units = {"time": "s", "phi_l": "rad", "bucket_force_x": "N", "x_T": "m", "torque_boom": "N m", "v_F": "m/s"}
     for number in range(n_loadings):
         save_signals(columns, units, folder / f"loading_{number:02d}" / "signals.parquet")
     return outcomes

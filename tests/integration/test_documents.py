@@ -128,9 +128,10 @@ def place(tmp_path, monkeypatch):
     Path("align.yaml").write_text("unit: m\n")
     time = np.linspace(0.1, 5.9, 100)
     angle, force = calibration_work.calc_curves(2500.0, 1.0, time)
-    rows = np.column_stack([time, angle, -3.0 + 0.4 * time, force, 2.0 * force])
+    speed = calibration_work.calc_speed(1.7e5, time)
+    rows = np.column_stack([time, angle, speed, -3.0 + 0.4 * time, force, 2.0 * force])
     Path("measured.csv").write_text(
-        "t [s],boom angle [rad],tip [m],push force [N],boom torque [N m]\n"
+        "t [s],boom angle [rad],speed [m/s],tip [m],push force [N],boom torque [N m]\n"
         + "\n".join(",".join(f"{value:.6g}" for value in row) for row in rows)
         + "\n"
     )

@@ -1,14 +1,16 @@
 """Fitting parameters to measured curves: surrogate of the curves, posterior of the parameters, where to simulate next.
 
-The simulated curves of n points are columns of numbers, divided by the measurement's noise. Their principal components
-hold nearly all of what the parameters change; each score z_k(x) gets a regression Kriging of its own (`surrogate`). A
-measurement has scores z_k, too, and with uniform priors in the ranges
+The simulated curves of n points are columns of numbers, each divided by what the measurement's noise and the scatter of
+single simulations leave of it, so that a part of a curve where chance rules does not hide one that tells something.
+Their principal components hold nearly all of what the parameters change; each score z_k(x) gets a regression Kriging
+of its own (`surrogate`). A measurement has scores z_k, too, and with uniform priors in the ranges
 
-    log p(x) = -1/2 sum_k [ (z_k - z^_k(x))^2 / v_k(x) + log v_k(x) ],   v_k = f (1 + lambda_k sigma_k^2) + s_k^2(x)
+    log p(x) = -1/2 sum_k [ (z_k - z^_k(x))^2 / v_k(x) + log v_k(x) ],
+    v_k = f (n_k^2 + lambda_k sigma_k^2) + s_k^2(x)
 
-with 1 the noise of the measurement, lambda sigma^2 the scatter of one simulation, which a measurement has as well, and
-s^2 the surrogate's own uncertainty. f >= 1 is the mean squared misfit at the best point where that is more than 1: a
-model that misses the measurement claims no narrow intervals.
+with n the noise of the measurement in the score, lambda sigma^2 the scatter of one simulation, which a measurement has
+as well, and s^2 the surrogate's own uncertainty. f >= 1 is the mean squared misfit at the best point where that is more
+than 1: a model that misses the measurement claims no narrow intervals.
 """
 
 from __future__ import annotations
@@ -117,7 +119,8 @@ def calibrate(
     n, d = X.shape
     if n < 2 * d + 2:
         raise InputError(f"calibration: {n} simulations for {d} parameters; at least {2 * d + 2} are needed")
-    scaled, target = F / noise, measured / noise
+    unit = np.hypot(noise, _estimate_scatter(X, F))
+    scaled, target = F / unit, measured / unit
     mean = scaled.mean(axis=0)
     _, singular, axes = np.linalg.svd(scaled - mean, full_matrices=False)
     share = np.cumsum(singular**2) / max(float(np.sum(singular**2)), 1e-300)
@@ -127,7 +130,8 @@ def calibrate(
     bounds = np.array([problem.low, problem.high])
     models = [Kriging(bounds=bounds, random_state=derive_seed(seed, "scores", j) % 2**31).fit(X, z)
               for j, z in enumerate(scores.T)]  # fmt: skip
-    scatter = np.array([model.lam_ * model.sigma2_ for model in models])
+    noise2 = np.sum((axes * (noise / unit)) ** 2, axis=1)
+    chance = noise2 + np.array([model.lam_ * model.sigma2_ for model in models])
 
     def predict(points: Array) -> tuple[Array, Array]:
         pairs = [model.predict(points, return_std=True) for model in models]
@@ -135,12 +139,12 @@ def calibrate(
 
     def calc_log(points: Array, factor: float) -> Array:
         centre, std = predict(points)
-        variance = factor * (1.0 + scatter) + std**2
+        variance = factor * chance + std**2
         return -0.5 * np.sum((wanted - centre) ** 2 / variance + np.log(variance), axis=1)
 
     draws, logs, best = _search(calc_log, problem, 1.0, seed)
     centre, std = predict(best[None])
-    explained = 1.0 + scatter + std[0] ** 2
+    explained = chance + std[0] ** 2
     misfit = float(np.mean((wanted - centre[0]) ** 2 / explained))
     if misfit > 1.0:
         draws, logs, best = _search(calc_log, problem, misfit, seed)
@@ -152,11 +156,28 @@ def calibrate(
     covariance = (draws - middle).T @ (weights[:, None] * (draws - middle))
     spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     correlation = covariance / np.outer(spread, spread)
-    predicted = (mean + predict(best[None])[0][0] @ axes) * noise
+    predicted = (mean + predict(best[None])[0][0] @ axes) * unit
     warnings = _judge(problem, low, high, confidence, correlation, misfit)
     return Calibration(
         problem, draws, weights, best, low, high, confidence, correlation, misfit, predicted, tuple(warnings)
     )
+
+
+def _estimate_scatter(X: Array, F: Array) -> Array:
+    """Return by how much single simulations scatter (m,): what a parabola in each parameter does not foresee of them.
+
+    Each simulation is foreseen by the parabola through all others (leave-one-out residuals).
+    """
+    n, d = X.shape
+    low, width = X.min(axis=0), np.maximum(np.ptp(X, axis=0), 1e-300)
+    scaled = 2.0 * (X - low) / width - 1.0
+    terms = [np.ones((n, 1)), scaled]
+    if n >= 3 * (2 * d + 1):
+        terms.append(scaled**2)
+    basis, _ = np.linalg.qr(np.hstack(terms))
+    leverage = np.minimum(np.sum(basis**2, axis=1), 1.0 - 1.0 / n)
+    left = (F - basis @ (basis.T @ F)) / (1.0 - leverage)[:, None]
+    return np.asarray(np.sqrt(np.mean(left**2, axis=0)))
 
 
 def _search(calc_log: Any, problem: Problem, factor: float, seed: int) -> tuple[Array, Array, Array]:
