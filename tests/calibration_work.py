@@ -31,7 +31,14 @@ def run(scenario, n_loadings, folder, *, progress=None):
     columns = {"time": time, "phi_l": angle, "bucket_force_x": force, "x_T": -3.0 + 0.4 * time}
     columns["torque_boom"] = 2.0 * force
     columns["v_F"] = calc_speed(scenario.machine.wheel.effort or 1.9e5, time)
-    units = {"time": "s", "phi_l": "rad", "bucket_force_x": "N", "x_T": "m", "torque_boom": "N m", "v_F": "m/s"}
+    units = {
+        "time": "s",
+        "phi_l": "rad",
+        "bucket_force_x": "N",
+        "x_T": "m",
+        "torque_boom": "N m",
+        "v_F": "m/s",
+    }
     for number in range(n_loadings):
         save_signals(columns, units, folder / f"loading_{number:02d}" / "signals.parquet")
     return outcomes
