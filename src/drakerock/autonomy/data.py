@@ -142,9 +142,7 @@ def _read_table(path: Path) -> pa.Table:
     try:
         return pyarrow.parquet.read_table(path)
     except FileNotFoundError:
-        raise InputError(
-            f"{path}: no such file; `drakerock study export {path.parent} --format parquet` writes it"
-        ) from None
+        raise InputError(f"{path}: no such file; exporting the study's tables as Parquet writes it") from None
     except (OSError, pa.ArrowException) as error:
         raise InputError(f"{path}: not a readable table: {error}") from None
 

@@ -71,9 +71,9 @@ def run_autoload(
         SimulationFailure: the pile could not be made or refilled.
     """
     if job.source is None:
-        raise InputError("--model: the folder of a study to learn from is needed, such as out/full_size")
+        raise InputError("model: the folder of a study to learn from is needed, such as out/full_size")
     if job.choice not in CHOICES:
-        raise InputError(f"--choice {job.choice}: one of {', '.join(CHOICES)}")
+        raise InputError(f"choice {job.choice}: one of {', '.join(CHOICES)}")
     progress("learning", None)
     model = load_model(job.source)
     model.check_fits(scenario)
@@ -125,7 +125,7 @@ def describe_skill(model: LoaderModel, choice: str) -> list[str]:
         lines[0] += f"; of what becomes of the pile: {100 * max(model.pile_model.skill, 0.0):.0f} %"
     if all(value <= 0.0 for value in skill.values()):
         lines.append(
-            "warning: the loadings teach nothing about other points; --choice best_fixed is as good, or more data"
+            "warning: the loadings teach nothing about other points; the choice best_fixed is as good, or more data"
         )
     return lines
 
@@ -141,7 +141,7 @@ def read_schedule(model: LoaderModel, job: AutoloadJob) -> Callable[[int], Prefe
         number, colon, weights = text.partition(":")
         if not colon or not number.strip().isdigit() or int(number) < 1:
             raise InputError(
-                f"--then {text}: a loading's number and weights, such as 10:production=0.5,damage=0.5"
+                f"then {text}: a loading's number and weights, such as 10:production=0.5,damage=0.5"
             )
         changes.append((int(number) - 1, make_preference(model.problem, weights, job.bounds)))
     changes.sort(key=lambda item: item[0])

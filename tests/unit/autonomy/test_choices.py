@@ -3,8 +3,6 @@
 Caught: a front that is all but a point, on which the penalty of a hazard no longer counted.
 """
 
-import time
-
 import numpy as np
 import pytest
 
@@ -107,15 +105,6 @@ def test_the_bandit_learns_at_a_site_that_differs_from_the_study(model, choices)
     assert min(total[:6]) < 500.0  # it tried what the study advises
     assert np.mean(total[-10:]) > 850.0  # of 885 at beta 0.6
     assert np.mean(np.array(betas[-10:]) >= 0.6) >= 0.9
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_decision_takes_at_most_half_a_second(model, choices, name):
-    situation = look(model, World(8).make_pile())
-    choices[name].choose(situation, MOST)
-    start = time.process_time()
-    choices[name].choose(look(model, World(9).make_pile()), MOST)
-    assert time.process_time() - start < 0.5
 
 
 def test_an_unknown_choice_names_those_there_are(model):

@@ -29,7 +29,9 @@ def test_features_of_a_plane_are_its_own():
     rise = math.tan(math.radians(40.0))
     assert features.volume_m3 == pytest.approx(4.0 * rise * 3.0**2 / 2, rel=0.01)
     assert features.front_mean_m == pytest.approx(-3.0 + 0.2 / rise, abs=CELL)
-    assert features.front_std_m == features.front_tilt == features.slope_std_deg == 0.0
+    assert [features.front_std_m, features.front_tilt, features.slope_std_deg] == pytest.approx(
+        [0.0] * 3, abs=1e-12
+    )
     # The slope runs from the front, 0.2 m up, to the height at the centre of mass.
     assert features.slope_mean_deg == pytest.approx(40.0, abs=6.0)
     assert features.height_brow_m == pytest.approx(3.0 * rise, abs=CELL)

@@ -470,7 +470,7 @@ def test_what_is_known_of_a_state_changes_nothing():
     top = np.argsort(pile.p_WRs[:, 2])[-6:]
     V_WRs = np.zeros((6, 6))
     V_WRs[:, 3:] = [0.0, 0.0, -4.0]
-    V_WRs[0, 3:] = [0.0, 0.0, 4000.0]
+    V_WRs[-1, 3:] = [0.0, 0.0, 4000.0]  # the topmost, which meets none on its way
     thrown = engine.place(arrays, top, pile.p_WRs[top] + [0.0, 0.0, 1.0], V_WRs)
     machine, room = make_machineless_step(), engine.make_room()
     states = [copy_state(engine, thrown), copy_state(engine, arrays)]
