@@ -95,12 +95,15 @@ def _copy_database(store: Store, path: Path, everything: bool) -> None:
     try:
         store.db.backup(copy)
         if not everything:
-            # What is left behind is not missing there.
+            # What is left behind is not missing there; the pile that an unfinished sequence goes on from comes along.
             rows = copy.execute(
-                "SELECT c.rowid, c.files FROM cycles c JOIN sequences s ON s.point = c.point AND s.attempt = c.attempt"
+                "SELECT c.rowid, c.files, s.status = 'running' AND c.loading = (SELECT MAX(d.loading) FROM cycles d "
+                "WHERE d.point = c.point AND d.attempt = c.attempt) "
+                "FROM cycles c JOIN sequences s ON s.point = c.point AND s.attempt = c.attempt"
             ).fetchall()
-            for row, files in rows:
-                kept = {name: value for name, value in json.loads(files).items() if name in KEPT_OF_OUTCOMES}
+            for row, files, goes_on in rows:
+                names = {*KEPT_OF_OUTCOMES, *([NEXT_PILE] if goes_on else [])}
+                kept = {name: value for name, value in json.loads(files).items() if name in names}
                 copy.execute("UPDATE cycles SET files = ? WHERE rowid = ?", (json.dumps(kept), row))
         copy.commit()
         copy.execute("PRAGMA journal_mode = DELETE")

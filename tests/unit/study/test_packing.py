@@ -94,6 +94,8 @@ def test_a_packed_study_goes_on_bit_for_bit(interrupted, finished, tmp_path, eve
     run_study(STUDY, folder, work=WORK)
     for name in ("responses.csv", "responses.parquet", "height_fields.parquet"):
         assert (folder / name).read_bytes() == (finished / name).read_bytes()
+    with Store.open(folder) as store:
+        assert verify_store(store) == []  # nor is the pile that was carried an orphan
 
 
 def test_the_pile_of_the_next_loading_is_carried_for_open_sequences_only(packed, tmp_path):
