@@ -75,7 +75,7 @@ def run_autonomous(
 
     As `run_sequence`, with ``decision.json`` in each loading's folder, written before the loading begins. A choice that
     learns does so from what is stored: resumed, it has learned the same. The preference may differ between loadings and
-    between sittings; each decision tells its own. A failed loading is recorded and is the last.
+    between runs; each decision tells its own. A failed loading is recorded and is the last.
 
     Args:
         scenario: the configuration; its planner gives way to the autonomous loader.
