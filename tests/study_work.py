@@ -21,7 +21,7 @@ from drakerock.identity import calc_config_hash
 from drakerock.loading.cost import LoadingCost
 from drakerock.loading.field import HeightField
 from drakerock.loading.field_file import save_height_fields
-from drakerock.loading.folder import HEIGHT_FIELDS, NEXT_PILE
+from drakerock.loading.folder import HEIGHT_FIELDS, NEXT_PILE, PLAN
 from drakerock.loading.outcome import CycleOutcome
 from drakerock.loading.sensing import make_grid
 from drakerock.randomness import make_generator
@@ -71,6 +71,7 @@ def _load(scenario, number, state, place, progress):
             progress(number, "s1", 1.0)
     (place / "signals.bin").write_bytes(rng.bytes(int(os.environ.get("STUDY_WORK_BYTES", "2000"))))
     (place / NEXT_PILE).write_text(json.dumps(state))
+    (place / PLAN).write_text(json.dumps({"reason": "no pile to plan on"}))
     failed = MODE == "fail" and s.alpha > 1.5 and number == 1 and scenario.dynamics.time_step > 0.006
     production = 100 * s.alpha + 30 * s.beta + 3 * state
     values = {"production": production, "damage": s.gamma**2 + 0.02 * state, "debris": 500 * s.kappa + state}

@@ -472,6 +472,9 @@ def study_pack(
     everything: Annotated[
         bool, typer.Option("--everything", help="Also signals, recordings and piles, where they are kept.")
     ] = False,
+    without_plans: Annotated[
+        bool, typer.Option("--without-plans", help="Leave the plans behind: a fifth of the size.")
+    ] = False,
 ) -> None:
     """Pack a study that is not running into one file, to be carried elsewhere and gone on with.
 
@@ -480,9 +483,8 @@ def study_pack(
     from drakerock.study.packing import pack_study
 
     with terminal.show_progress("pack"):
-        path = pack_study(
-            folder, out or folder.with_name(f"{folder.resolve().name}.tar.xz"), everything=everything
-        )
+        path = out or folder.with_name(f"{folder.resolve().name}.tar.xz")
+        pack_study(folder, path, everything=everything, plans=not without_plans)
     terminal.print_paths([path])
 
 

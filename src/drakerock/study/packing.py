@@ -14,26 +14,29 @@ import lzma
 import sqlite3
 import tarfile
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from drakerock.errors import InputError
 from drakerock.files import make_folder
-from drakerock.loading.folder import NEXT_PILE
+from drakerock.loading.folder import NEXT_PILE, PLAN
 from drakerock.study.db import DATABASE, KEPT_OF_OUTCOMES, POINTS, STUDY, Store, hash_file
 
 MANIFEST = "manifest.json"
 _FORMAT, _VERSION = "drakerock-study", 1
 
 
-def pack_study(folder: str | Path, path: str | Path, *, everything: bool = False) -> Path:
+def pack_study(
+    folder: str | Path, path: str | Path, *, everything: bool = False, plans: bool = True
+) -> Path:
     """Pack a study into one file.
 
     Args:
         folder: the study; not one that is running.
         path: the file to write, such as ``paper.tar.xz``; an old one is replaced once the new one is whole.
         everything: also the signals, recordings and piles of finished loadings, where the study keeps them.
+        plans: also the plans, which are four fifths of the file without `everything`.
 
     Returns:
         The path.
@@ -47,8 +50,9 @@ def pack_study(folder: str | Path, path: str | Path, *, everything: bool = False
         try:
             with tempfile.TemporaryDirectory() as temporary:
                 copy = Path(temporary) / DATABASE
-                _copy_database(store, copy, everything)
-                members = {STUDY: folder / STUDY, DATABASE: copy} | dict(_list_files(store, everything))
+                keeps = _make_filter(everything, plans)
+                _copy_database(store, copy, keeps)
+                members = {STUDY: folder / STUDY, DATABASE: copy} | dict(_list_files(store, keeps))
                 make_folder(path.parent)
                 _write(partial, members)
             partial.replace(path)
@@ -89,22 +93,29 @@ def unpack_study(path: str | Path, folder: str | Path) -> Path:
     return folder
 
 
-def _copy_database(store: Store, path: Path, everything: bool) -> None:
+def _make_filter(everything: bool, plans: bool) -> Callable[[str], bool]:
+    """Return which recorded files of a finished loading come along, by their name."""
+    return lambda name: (everything or name in KEPT_OF_OUTCOMES) and (plans or name != PLAN)
+
+
+def _copy_database(store: Store, path: Path, keeps: Callable[[str], bool]) -> None:
     """Copy the database as it is at one instant, without its log."""
     copy = sqlite3.connect(path)
     try:
         store.db.backup(copy)
-        if not everything:
-            # What is left behind is not missing there; the pile that an unfinished sequence goes on from comes along.
-            rows = copy.execute(
-                "SELECT c.rowid, c.files, s.status = 'running' AND c.loading = (SELECT MAX(d.loading) FROM cycles d "
-                "WHERE d.point = c.point AND d.attempt = c.attempt) "
-                "FROM cycles c JOIN sequences s ON s.point = c.point AND s.attempt = c.attempt"
-            ).fetchall()
-            for row, files, goes_on in rows:
-                names = {*KEPT_OF_OUTCOMES, *([NEXT_PILE] if goes_on else [])}
-                kept = {name: value for name, value in json.loads(files).items() if name in names}
-                copy.execute("UPDATE cycles SET files = ? WHERE rowid = ?", (json.dumps(kept), row))
+        # What is left behind is not missing there; the pile that an unfinished sequence goes on from comes along.
+        rows = copy.execute(
+            "SELECT c.rowid, c.files, s.status = 'running' AND c.loading = (SELECT MAX(d.loading) FROM cycles d "
+            "WHERE d.point = c.point AND d.attempt = c.attempt) "
+            "FROM cycles c JOIN sequences s ON s.point = c.point AND s.attempt = c.attempt"
+        ).fetchall()
+        for row, files, goes_on in rows:
+            kept = {
+                name: value
+                for name, value in json.loads(files).items()
+                if keeps(name) or (goes_on and name == NEXT_PILE)
+            }
+            copy.execute("UPDATE cycles SET files = ? WHERE rowid = ?", (json.dumps(kept), row))
         copy.commit()
         copy.execute("PRAGMA journal_mode = DELETE")
         copy.execute("VACUUM")
@@ -112,7 +123,7 @@ def _copy_database(store: Store, path: Path, everything: bool) -> None:
         copy.close()
 
 
-def _list_files(store: Store, everything: bool) -> Iterator[tuple[str, Path]]:
+def _list_files(store: Store, keeps: Callable[[str], bool]) -> Iterator[tuple[str, Path]]:
     """Return the files that belong to the study, by their name in it, in order."""
     sequences = store.db.execute(
         "SELECT s.point, s.attempt, s.status, (SELECT COUNT(*) FROM cycles c WHERE c.point = s.point AND "
@@ -120,11 +131,7 @@ def _list_files(store: Store, everything: bool) -> Iterator[tuple[str, Path]]:
     ).fetchall()
     for point, attempt, status, n_cycles in sequences:
         folder = store.find_sequence_folder(point, attempt)
-        names = [
-            name
-            for name in store.list_files(point, attempt)
-            if everything or name.split("/")[-1] in KEPT_OF_OUTCOMES
-        ]
+        names = [name for name in store.list_files(point, attempt) if keeps(name.partition("/")[2])]
         if status == "running" and n_cycles:
             last = f"loading_{n_cycles - 1:02d}"
             names += [name for name in (f"{last}/{NEXT_PILE}",) if name not in names]

@@ -83,14 +83,15 @@ def rewrite(path, change):
             archive.addfile(entry, io.BytesIO(data))
 
 
-@pytest.mark.parametrize("everything", [False, True])
-def test_a_packed_study_goes_on_bit_for_bit(interrupted, finished, tmp_path, everything):
-    path = pack_study(interrupted, tmp_path / "study.tar.xz", everything=everything)
+@pytest.mark.parametrize(("everything", "plans"), [(False, True), (True, True), (False, False)])
+def test_a_packed_study_goes_on_bit_for_bit(interrupted, finished, tmp_path, everything, plans):
+    path = pack_study(interrupted, tmp_path / "study.tar.xz", everything=everything, plans=plans)
     folder = unpack_study(path, tmp_path / "elsewhere" / "store")
     with Store.open(folder) as store:
         assert read_status(store)["cycles"]["recorded"] == 8
         assert verify_store(store) == []
     assert bool(list(folder.rglob("signals.bin"))) == everything
+    assert bool(list(folder.rglob("plan.json"))) == plans
     run_study(STUDY, folder, work=WORK)
     for name in ("responses.csv", "responses.parquet", "height_fields.parquet"):
         assert (folder / name).read_bytes() == (finished / name).read_bytes()

@@ -248,7 +248,7 @@ def test_keeping_outcomes_only(tmp_path):
     with Store.open(tmp_path / "store") as store:
         assert verify_store(store) == []
     names = {path.name for path in (tmp_path / "store/points").rglob("*") if path.is_file()}
-    assert names <= {"outcome.json", "height_fields.npz", "attempt_0.lock"}
+    assert names <= {"outcome.json", "plan.json", "height_fields.npz", "attempt_0.lock"}
 
 
 def test_failures_are_retried_with_another_seed_and_step(tmp_path, behave):
