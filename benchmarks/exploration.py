@@ -24,6 +24,7 @@ from rich.table import Table
 from scipy.spatial.distance import cdist
 
 from drakerock.exploration.config import ParetoConfig, SamplingConfig, SensitivityConfig
+from drakerock.exploration.kriging import Kriging
 from drakerock.exploration.pareto import pareto_front
 from drakerock.exploration.problems import (
     KnownProblem,
@@ -42,7 +43,7 @@ from drakerock.exploration.sampling import (
     make_validation_points,
 )
 from drakerock.exploration.sensitivity import calc_sensitivity
-from drakerock.exploration.surrogate import Kriging, Surrogate, calc_ranges, fit_surrogate
+from drakerock.exploration.surrogate import Surrogate, calc_ranges, fit_surrogate
 from drakerock.exploration.validation import validate
 from drakerock.study.analysis import run_report
 

@@ -10,8 +10,9 @@ from drakerock.autonomy.data import LoadingData
 from drakerock.autonomy.encoding import PileEncoder
 from drakerock.autonomy.entry import PileGrid, calc_entry_features
 from drakerock.autonomy.regression import LandmarkRegressor, find_theta
+from drakerock.exploration.kriging import Kriging
 from drakerock.exploration.problem import Array, Problem
-from drakerock.exploration.surrogate import Kriging, Surrogate
+from drakerock.exploration.surrogate import Surrogate
 from drakerock.loading.features import calc_pile_features
 from drakerock.loading.field import HeightField
 from drakerock.randomness import derive_seed, make_generator

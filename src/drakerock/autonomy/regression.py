@@ -2,7 +2,7 @@
 
     y = mean + scale (phi(z) . w) + noise,    phi(z) = [1, z, K_LL^(-1/2) k(z, landmarks)]
 
-with the kernel of `drakerock.exploration.surrogate`, k(u, v) = exp(-sum_j theta_j (u_j - v_j)^2), at rows drawn at
+with the kernel of `drakerock.exploration.kriging`, k(u, v) = exp(-sum_j theta_j (u_j - v_j)^2), at rows drawn at
 random (Nystrom features, Williams & Seeger 2001; scikit-learn's `Nystroem`). theta comes from the likelihood of a
 Kriging of a part of the rows, the variances of weights and noise from that of all (scikit-learn's `BayesianRidge`).
 """
@@ -16,8 +16,8 @@ from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.kernel_approximation import Nystroem
 from sklearn.linear_model import BayesianRidge
 
+from drakerock.exploration.kriging import Kriging
 from drakerock.exploration.problem import Array
-from drakerock.exploration.surrogate import Kriging
 from drakerock.randomness import make_generator
 
 

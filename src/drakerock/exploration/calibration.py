@@ -23,9 +23,9 @@ from scipy.stats import qmc
 
 from drakerock.errors import InputError
 from drakerock.exploration.config import SamplingConfig
+from drakerock.exploration.kriging import Kriging
 from drakerock.exploration.problem import Array, Problem
 from drakerock.exploration.sampling import make_sampler
-from drakerock.exploration.surrogate import Kriging
 from drakerock.randomness import derive_seed
 
 # Principal components hold so much of the curves' variance, and there are at most so many.

@@ -27,10 +27,11 @@ from scipy.stats import qmc
 from drakerock.errors import InputError
 from drakerock.exploration.config import ParetoConfig, SamplingConfig
 from drakerock.exploration.hypervolume import make_directions, measure_lengths
+from drakerock.exploration.kriging import Kriging, calc_correlation
 from drakerock.exploration.one_at_a_time import make_one_at_a_time
 from drakerock.exploration.pareto import calc_non_dominated, pareto_front
 from drakerock.exploration.problem import Array, Problem
-from drakerock.exploration.surrogate import Kriging, Surrogate, calc_correlation, calc_ranges
+from drakerock.exploration.surrogate import Surrogate, calc_ranges
 from drakerock.randomness import derive_seed, make_generator
 
 

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
 from drakerock.errors import InputError
@@ -33,6 +35,8 @@ from drakerock.study.replays import link_replays, write_study_replays
 from drakerock.study.tables import export_tables
 
 _CONFIRMATION = "confirmation.json"
+# Beside a table: the surrogate fitted to it, so that nobody has to wait for the fit again.
+SURROGATE = "surrogate.json"
 
 
 def run_report(
@@ -46,7 +50,8 @@ def run_report(
 
     Args:
         source: study folder or table file.
-        out: folder to write into; None: `report` in the study folder, or beside the table.
+        out: folder to write into; None: `report` in the study folder, or beside the table, where the fitted
+            surrogate is then kept, too.
         progress: told what is being done.
         replays: make the replay of each loading first; those that are there are linked anyway.
 
@@ -67,6 +72,8 @@ def run_report(
     name = table.provenance.get("name")
     title = f"Exploration of {name}" if name else f"Exploration of {source.resolve().name}"
     exploration = explore(table, config, seed, confirmation, progress)
+    if out is None:
+        exploration.surrogate.save(folder / SURROGATE)
     if progress:
         progress("drawing", None)
     return write_report(exploration, place, title)
@@ -103,7 +110,7 @@ def run_strategy(
         table.problem.get_objective(best)
         weights = {best: 1.0}
     limits = [parse_bound(text, table.problem, probability) for text in bounds]
-    surrogate, front = _search_front(table, config, seed, limits, progress)
+    surrogate, front = _search_front(Path(source), table, config, seed, limits, progress)
     chosen = choose_strategy(front, weights, limits)
     name = chosen.chosen_by if best is None else _name(best, limits)
     return replace(chosen, verdict=_judge(surrogate, table), chosen_by=name)
@@ -131,7 +138,7 @@ class Predictor:
     def __init__(self, source: str | Path) -> None:
         table, config, seed = _load(Path(source))
         self.problem = table.problem
-        self._surrogate = fit_surrogate(table, config.surrogate, seed)
+        self._surrogate = _get_surrogate(Path(source), table, config, seed)
         self.verdict = _judge(self._surrogate, table)
 
     def predict(self, values: Mapping[str, float]) -> Strategy:
@@ -180,7 +187,7 @@ def run_confirm(
     if n is not None and n < 1:
         raise InputError(f"confirm: asked for {n} points; ask for at least one")
     table, config, seed = _load(Path(source))
-    surrogate, front = _search_front(table, config, seed, progress=progress)
+    surrogate, front = _search_front(Path(source), table, config, seed, progress=progress)
     chosen = select_spread(front, n or config.n_confirm, [choose_strategy(front).index])
     if progress:
         progress("simulating", None)
@@ -219,6 +226,7 @@ def _join(value: float, spread: float) -> str:
 
 
 def _search_front(
+    source: Path,
     table: ResponseTable,
     config: ExplorationConfig,
     seed: int,
@@ -227,11 +235,25 @@ def _search_front(
 ) -> tuple[Surrogate, ParetoFront]:
     tell = progress or (lambda _stage, _share: None)
     tell("fitting", None)
-    surrogate = fit_surrogate(table, config.surrogate, seed)
+    surrogate = _get_surrogate(source, table, config, seed)
     front = pareto_front(
         surrogate, bounds, config.pareto, seed, lambda share: tell("searching the front", share)
     )
     return surrogate, front
+
+
+def _get_surrogate(source: Path, table: ResponseTable, config: ExplorationConfig, seed: int) -> Surrogate:
+    """Return the surrogate of a table: the one that is kept beside it if it is of these samples and settings."""
+    path = _find_folder(source) / SURROGATE
+    if path.exists():
+        with suppress(InputError):  # a damaged one is no loss
+            kept, samples = Surrogate.load(path), table.select("sample")
+            if (kept.problem_, kept.config, kept.seed) == (table.problem, config.surrogate, seed) and all(
+                np.array_equal(mine, its, equal_nan=True)
+                for mine, its in ((kept.X_, samples.X), (kept.Y_, samples.Y), (kept.noise_, samples.noise))
+            ):
+                return kept
+    return fit_surrogate(table, config.surrogate, seed)
 
 
 def _find_folder(source: Path) -> Path:

@@ -27,9 +27,7 @@ MANIFEST = "manifest.json"
 _FORMAT, _VERSION = "drakerock-study", 1
 
 
-def pack_study(
-    folder: str | Path, path: str | Path, *, everything: bool = False, plans: bool = True
-) -> Path:
+def pack_study(folder: str | Path, path: str | Path, *, everything: bool = False, plans: bool = True) -> Path:
     """Pack a study into one file.
 
     Args:

@@ -1,3 +1,4 @@
+import json
 import warnings
 
 import numpy as np
@@ -9,15 +10,10 @@ from sklearn.utils.estimator_checks import check_estimator
 
 from drakerock.errors import InputError
 from drakerock.exploration.config import SurrogateConfig
+from drakerock.exploration.kriging import Kriging, PowerExponential, calc_correlation
 from drakerock.exploration.problem import Objective, Problem, Variable
 from drakerock.exploration.problems import make_branin, make_ishigami, make_noisy_loading, make_noisy_table
-from drakerock.exploration.surrogate import (
-    Kriging,
-    PowerExponential,
-    Surrogate,
-    calc_correlation,
-    fit_surrogate,
-)
+from drakerock.exploration.surrogate import Surrogate, fit_surrogate
 
 RNG = np.random.default_rng
 
@@ -307,3 +303,50 @@ def test_validation_points_take_no_part():
     model = fit_surrogate(table).models_[0]
     assert len(model.y_train_) == 40
     assert np.array_equal(model.y_train_, table.Y[:40, 0])
+
+
+@pytest.mark.parametrize("trend", ["mean", "likelihood"])
+def test_a_stored_surrogate_predicts_the_same_bit_for_bit(tmp_path, trend):
+    known = make_noisy_loading()
+    X, Y = make_data(known, 30, noise=0.1)
+    Y[3, 1] = np.nan
+    Y[:, 2] = 7.0
+    noise = np.full(Y.shape, 0.05)
+    noise[4] = np.nan
+    fitted = Surrogate(known.problem, SurrogateConfig(trend=trend), 5).fit(X, Y, noise)
+    fitted.save(tmp_path / "surrogate.json")
+    stored = Surrogate.load(tmp_path / "surrogate.json")
+    places = make_data(known, 200, seed=1)[0]
+    for mine, its in zip(
+        fitted.predict(places, return_std=True), stored.predict(places, return_std=True), strict=True
+    ):
+        np.testing.assert_array_equal(mine, its)
+    np.testing.assert_array_equal(fitted.draw(places[:9], 3, RNG(0)), stored.draw(places[:9], 3, RNG(0)))
+    assert (stored.problem_, stored.config, stored.seed) == (fitted.problem_, fitted.config, fitted.seed)
+
+
+def _drop_model(data):
+    del data["models"]["damage"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_drop_model, "'damage' is missing"),
+        (lambda data: data["X"].pop(), "shapes|expected X"),
+        (lambda data: data["X"].__setitem__(0, ["one", 2, 3, 4]), "could not convert"),
+        (lambda data: data["models"]["debris"].update(theta=[1.0, 2.0]), "theta must be 4 numbers"),
+        (lambda data: data["models"]["debris"].update(lam=None), "not a readable surrogate"),
+        (lambda data: data["models"]["debris"].update(variance=-1.0), "not a readable surrogate"),
+        (lambda data: data["problem"]["variables"][0].update(low=3.0), "not a readable surrogate"),
+    ],
+)
+def test_what_is_no_surrogate_is_refused(tmp_path, change, message):
+    known = make_noisy_loading()
+    path = tmp_path / "surrogate.json"
+    Surrogate(known.problem).fit(*make_data(known, 12, noise=0.1)).save(path)
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+    with pytest.raises(InputError, match=message):
+        Surrogate.load(path)

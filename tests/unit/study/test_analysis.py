@@ -1,5 +1,7 @@
 import json
 import pickle
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +11,10 @@ import drakerock
 from drakerock.cli import app
 from drakerock.errors import InputError
 from drakerock.exploration.config import ExplorationConfig, ParetoConfig, SensitivityConfig, SurrogateConfig
+from drakerock.exploration.pareto import pareto_front
 from drakerock.exploration.problems import make_noisy_loading, make_noisy_table
 from drakerock.exploration.surrogate import Surrogate
+from drakerock.exploration.table import ResponseTable
 from drakerock.study import analysis
 from drakerock.study.analysis import run_confirm, run_report, run_strategy
 from drakerock.viewing import report
@@ -213,3 +217,36 @@ def test_public_names():
     assert drakerock.Surrogate is surrogate.Surrogate
     assert drakerock.pareto_front is pareto.pareto_front
     assert drakerock.choose_strategy is strategy.choose_strategy
+
+
+@pytest.fixture(scope="module")
+def reported(folder, tmp_path_factory):
+    place = shutil.copytree(folder, tmp_path_factory.mktemp("reported") / "study")
+    run_report(place)
+    return place
+
+
+def test_a_report_keeps_the_surrogate_and_a_strategy_takes_it(reported, tmp_path, monkeypatch):
+    place = shutil.copytree(reported, tmp_path / "study")
+    before = run_strategy(place).to_dict()
+    monkeypatch.setattr(analysis, "fit_surrogate", lambda *_: pytest.fail("fitted again"))
+    monkeypatch.setattr(analysis, "pareto_front", pareto_front)
+    assert run_strategy(place).to_dict() == before
+
+
+@pytest.mark.parametrize("stale", ["another seed", "another response", "damaged"])
+def test_a_surrogate_of_something_else_is_not_taken(reported, tmp_path, monkeypatch, stale):
+    place = shutil.copytree(reported, tmp_path / "study")
+    if stale == "another seed":
+        study = json.loads((place / "study.json").read_text())
+        (place / "study.json").write_text(json.dumps(study | {"seed": 6}))
+    elif stale == "another response":
+        table = ResponseTable.load(place)
+        replace(table, Y=table.Y * 1.01).save(place / "responses.csv")
+    else:
+        (place / analysis.SURROGATE).write_text("{}")
+    fits = []
+    fit = analysis.fit_surrogate
+    monkeypatch.setattr(analysis, "fit_surrogate", lambda *args: fits.append(args) or fit(*args))
+    run_strategy(place)
+    assert len(fits) == 1
