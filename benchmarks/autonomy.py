@@ -47,8 +47,10 @@ from drakerock.loading.config import StrategyConfig
 from drakerock.loading.cycle import run_cycle
 from drakerock.loading.features import PileFeatures, calc_pile_features
 from drakerock.loading.field import HeightField
+from drakerock.loading.folder import NEXT_PILE
 from drakerock.loading.scenario import Scenario, load_scenario
 from drakerock.loading.sensing import make_grid
+from drakerock.loading.sequence import run_sequence
 from drakerock.randomness import make_generator
 from drakerock.study.jobs import get_pile
 
@@ -57,7 +59,7 @@ COARSE = [
     {"size_m": 1.0, "mass_fraction": 0.2},
 ]  # fmt: skip
 # Starting piles of other seeds; flatter and steeper ones by the rocks' friction; other voids behind the brow, which
-# press on the slope otherwise; coarser rock.
+# press on the slope otherwise; coarser rock; a front that is dug at one place only, so many times.
 PILES: dict[str, dict[str, Any]] = {
     **{f"seed_{seed}": {"seed": seed} for seed in range(11, 16)},
     "smooth_21": {"seed": 21, "rocks.friction": 0.6},
@@ -67,7 +69,11 @@ PILES: dict[str, dict[str, Any]] = {
     "shallow_25": {"seed": 25, "site.void_depth": 7.0},
     "coarse_26": {"seed": 26, "rocks.gradation": COARSE},
     "seed_27": {"seed": 27},
+    "uneven_28": {"seed": 28, "dug": 4},
+    "uneven_29": {"seed": 29, "dug": 4},
 }
+# Always at the rear-most place, where the last loading has dug already: a notch, deeper each time.
+NOTCH = {"alpha": 1.2, "beta": 0.5, "gamma": 0.0, "kappa": 0.8}
 OBJECTIVES = ("production", "damage", "debris")
 NUMBERS = ("J_per_kg", "wheel_slip_m", "bucket_mass_kg", "loading_time_s")
 
@@ -183,6 +189,19 @@ def draw_accuracy(rows: list[dict[str, Any]], names: list[str], path: Path) -> N
     figure.savefig(path)
 
 
+def make_start(base: Scenario, pile: str, out: Path) -> Scenario:
+    """Return the scenario whose pile is one of `PILES`; what has to be dug for it is dug once."""
+    changes = dict(PILES[pile])
+    dug = changes.pop("dug", 0)
+    scenario = base.replace(**changes)
+    if not dug:
+        return scenario
+    folder = out / "dug" / pile
+    run_sequence(scenario.replace(**{"loading.strategy": NOTCH}), dug, folder)
+    drop_large_files(folder)
+    return scenario.replace(**{"pile.source": str(folder / f"loading_{dug - 1:02d}" / NEXT_PILE)})
+
+
 def run_sequences(args: argparse.Namespace) -> None:
     base = load_scenario(args.scenario, args.set or [])
     data = read_loading_data(args.model)
@@ -192,7 +211,7 @@ def run_sequences(args: argparse.Namespace) -> None:
         kept = data.take(np.isin(data.point, names[: max(round(share * len(names)), 7)]))
         model = LoaderModel(kept)
         for pile in args.piles:
-            scenario = base.replace(**PILES[pile])
+            scenario = make_start(base, pile, args.out)
             for label in args.choices:
                 choice, _, depth = label.partition(":")
                 name = label.replace(":", "_") + ("" if share == 1 else f"_share_{share:g}")

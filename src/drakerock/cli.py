@@ -631,7 +631,12 @@ def calibrate(
 
 @app.command()
 def strategy(
-    source: Annotated[Path, typer.Argument(metavar="DIR", help="Study folder or response table.")],
+    source: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[DIR]", help="Study folder or response table [default: studies/full_size, shipped]."
+        ),
+    ] = None,
     weights: Annotated[
         str | None, typer.Option(help="Trade-off, such as production=0.6,damage=0.2,debris=0.2.")
     ] = None,
@@ -651,17 +656,19 @@ def strategy(
 ) -> None:
     """Print the Pareto-optimal strategy for a trade-off, and how far the study can be relied on.
 
-    Example: drakerock strategy out/paper --weights production=0.6,damage=0.2,debris=0.2
+    Example: drakerock strategy --weights production=0.6,damage=0.2,debris=0.2
 
-    Example: drakerock strategy out/paper --best production --bound 'debris<=500'
+    Example: drakerock strategy out/smoke --best production --bound 'debris<=500'
     """
-    from drakerock.study.analysis import run_strategy
+    from drakerock.study.analysis import FULL_SIZE, run_strategy
 
     if knee + (weights is not None) + (best is not None) > 1:
         raise InputError("--knee, --weights and --best exclude each other")
     limits = [part for text in bound or [] for part in text.split(",") if part.strip()]
     with terminal.show_progress("strategy") as advance:
-        chosen = run_strategy(source, weights, limits, advance, best=best, probability=probability)
+        chosen = run_strategy(
+            source or FULL_SIZE, weights, limits, advance, best=best, probability=probability
+        )
     print(json.dumps(chosen.to_dict(), indent=2) if json_ else chosen.to_text())
 
 

@@ -22,6 +22,7 @@ from drakerock.exploration.problem import Array, Problem
 from drakerock.exploration.table import ResponseTable
 from drakerock.files import read_json, write_text
 from drakerock.randomness import derive_seed
+from drakerock.resources import find_study_file
 
 
 class Surrogate(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -128,10 +129,12 @@ class Surrogate(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def load(cls, path: str | Path) -> Self:
         """Return what `save` wrote: it predicts the same, bit for bit, and nothing is searched for.
 
+        ``studies/full_size/surrogate.json`` is shipped.
+
         Raises:
             InputError: missing, or not a fitted surrogate.
         """
-        data = read_json(Path(path), "a readable surrogate")
+        data = read_json(find_study_file(Path(path)), "a readable surrogate")
         try:
             problem = Problem.model_validate(data["problem"])
             config = SurrogateConfig.model_validate(data["config"])

@@ -37,6 +37,7 @@ from drakerock.exploration.noise import calc_autocorrelation, calc_standard_erro
 from drakerock.exploration.problem import MAX_MAGNITUDE, Array, Problem
 from drakerock.exploration.table_file import TableFile, read_csv, read_parquet
 from drakerock.files import read_json
+from drakerock.resources import find_study_file
 
 ROLES = ("sample", "validation")
 # What else people call them; an empty cell is a sample.
@@ -172,6 +173,8 @@ class ResponseTable:
     def load(cls, path: str | Path, problem: Problem | None = None) -> Self:
         """Read a table from a file, or from a study folder with `responses.parquet` or `responses.csv`.
 
+        ``studies/full_size`` is shipped.
+
         The problem is taken from, in this order: the argument, the file itself (Parquet), `study.json` beside
         it (key `problem`), the default `Problem`. What is taken for something else than it looks (other separators,
         decimal commas, names spelled otherwise) is logged as a warning.
@@ -181,7 +184,7 @@ class ResponseTable:
                 numbers or out of range.
         """
         try:
-            path = _find_table(Path(path))
+            path = _find_table(find_study_file(Path(path)))
             provenance = _read_provenance(path.parent / "study.json")
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from None

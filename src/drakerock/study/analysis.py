@@ -1,7 +1,7 @@
 """What a finished (or running) study says: report, confirmation, strategy.
 
 A source is a study folder, whose store is exported first; or a folder with a table (`responses.parquet` or
-`responses.csv`) and, where there is one, `study.json` beside it; or such a table alone. Of `study.json`, `problem`
+`responses.csv`) and, where there is one, `study.json` beside it; or such a table alone. `FULL_SIZE` is shipped. Of `study.json`, `problem`
 (variables and objectives), `exploration` (settings, an `ExplorationConfig`) and `seed` are used, and all of it is
 shown in the report.
 """
@@ -30,10 +30,13 @@ from drakerock.exploration.table import ResponseTable
 from drakerock.exploration.validation import calc_learning_curve, validate
 from drakerock.exploration.verdict import Grade, Verdict, judge
 from drakerock.files import read_json, write_text
+from drakerock.resources import find_study_file
 from drakerock.study.db import DATABASE
 from drakerock.study.replays import link_replays, write_study_replays
 from drakerock.study.tables import export_tables
 
+# The shipped study: the method at full size.
+FULL_SIZE = Path("studies/full_size")
 _CONFIRMATION = "confirmation.json"
 # Beside a table: the surrogate fitted to it, so that nobody has to wait for the fit again.
 SURROGATE = "surrogate.json"
@@ -61,7 +64,7 @@ def run_report(
     # matplotlib and plotly take a second to import: only who wants a report pays for it.
     from drakerock.viewing.report import write_report
 
-    source = Path(source)
+    source = find_study_file(Path(source))
     if replays:
         write_study_replays(source, progress)
     table, config, seed = _load(source)
@@ -101,7 +104,8 @@ def run_strategy(
     Raises:
         InputError: weights and `best` both; see `parse_weights`, `parse_bound`, `pareto_front` and `choose_strategy`.
     """
-    table, config, seed = _load(Path(source))
+    source = find_study_file(Path(source))
+    table, config, seed = _load(source)
     if isinstance(weights, str):
         weights = parse_weights(weights, table.problem)
     if best is not None:
@@ -110,7 +114,7 @@ def run_strategy(
         table.problem.get_objective(best)
         weights = {best: 1.0}
     limits = [parse_bound(text, table.problem, probability) for text in bounds]
-    surrogate, front = _search_front(Path(source), table, config, seed, limits, progress)
+    surrogate, front = _search_front(source, table, config, seed, limits, progress)
     chosen = choose_strategy(front, weights, limits)
     name = chosen.chosen_by if best is None else _name(best, limits)
     return replace(chosen, verdict=_judge(surrogate, table), chosen_by=name)
@@ -136,9 +140,10 @@ class Predictor:
     """
 
     def __init__(self, source: str | Path) -> None:
-        table, config, seed = _load(Path(source))
+        source = find_study_file(Path(source))
+        table, config, seed = _load(source)
         self.problem = table.problem
-        self._surrogate = _get_surrogate(Path(source), table, config, seed)
+        self._surrogate = _get_surrogate(source, table, config, seed)
         self.verdict = _judge(self._surrogate, table)
 
     def predict(self, values: Mapping[str, float]) -> Strategy:

@@ -21,13 +21,30 @@ def benchmark():
     return module
 
 
-def test_piles_are_scenarios_of_seeds_of_their_own(benchmark):
+@pytest.fixture
+def dug(benchmark, monkeypatch):
+    """What is asked to be dug, instead of digging it."""
+    asked = []
+    monkeypatch.setattr(benchmark, "run_sequence", lambda *args: asked.append(args))
+    return asked
+
+
+def test_piles_are_scenarios_of_seeds_of_their_own(benchmark, dug, tmp_path):
     base = load_scenario()
-    seeds = [base.replace(**changes).seed for changes in benchmark.PILES.values()]
+    seeds = [benchmark.make_start(base, pile, tmp_path).seed for pile in benchmark.PILES]
     assert len(set(seeds)) == len(seeds) >= 10
     assert base.seed not in seeds
     assert 0 not in seeds
     assert max(item.size_m for item in base.replace(**benchmark.PILES["coarse_26"]).rocks.gradation) == 1.0
+
+
+def test_an_uneven_pile_is_one_that_was_dug_at_its_rear_most_place(benchmark, dug, tmp_path):
+    base = load_scenario()
+    start = benchmark.make_start(base, "uneven_28", tmp_path)
+    ((digging, n, folder),) = dug
+    assert (digging.loading.strategy.gamma, n) == (0.0, 4)
+    assert start.pile.source == str(folder / "loading_03" / "pile_next.npz")
+    assert start.loading.strategy == base.loading.strategy
 
 
 def write(folder, choice, pile, productions, failed=()):
