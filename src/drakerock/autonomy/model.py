@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import os
+from contextlib import suppress
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
+import joblib
 import numpy as np
+from platformdirs import user_cache_path
 from pydrake.systems.framework import DiagramBuilder
 
 from drakerock.autonomy.bandit import BanditChoice
@@ -51,6 +57,25 @@ _LEAST_SPREAD = 0.1
 _FRONT = ParetoConfig(population=200, evaluations=12_000, n_draws=0)
 
 
+class _Learned(cached_property):  # type: ignore[type-arg]
+    """A part of the model that takes long to learn: kept in the model's folder, where it has one."""
+
+    def __get__(self, model: Any, owner: Any = None) -> Any:
+        if model is None or self.attrname in vars(model) or model.folder is None:
+            return super().__get__(model, owner)
+        path = model.folder / f"{self.attrname}.joblib"
+        with suppress(Exception):  # missing, or damaged: whatever unpickling then raises
+            vars(model)[self.attrname] = joblib.load(path)
+            return vars(model)[self.attrname]
+        part = super().__get__(model, owner)
+        with suppress(OSError):  # no room, no permission: it is learned again next time
+            path.parent.mkdir(parents=True, exist_ok=True)
+            partial = path.with_suffix(f".{os.getpid()}")
+            joblib.dump(part, partial)
+            partial.replace(path)
+        return part
+
+
 class LoaderModel:
     """What a study's loadings teach.
 
@@ -58,12 +83,19 @@ class LoaderModel:
         data: the loadings to learn from.
         seed: of all randomness in learning and choosing.
         machine: the machine's size; None: of the data's scenario.
+        cache: folder in which what is learned is kept, for the next model of the same data; None: nowhere.
 
     Raises:
         InputError: the study's variables are not those of a strategy.
     """
 
-    def __init__(self, data: LoadingData, seed: int = 0, machine: DiggingMachine | None = None) -> None:
+    def __init__(
+        self,
+        data: LoadingData,
+        seed: int = 0,
+        machine: DiggingMachine | None = None,
+        cache: Path | None = None,
+    ) -> None:
         known = tuple(StrategyConfig.model_fields)
         keys = data.keys or tuple(f"loading.strategy.{name}" for name in data.problem.variable_names)
         other = [
@@ -80,6 +112,19 @@ class LoaderModel:
         self.machine = machine or measure_machine(scenario)
         self.gamma = scenario.loading.strategy.gamma
         self.grid = self.make_grid(HeightField(data.x, data.y, data.before[0], data.cell), scenario)
+        # A machine that is given is no part of what the folder is named by.
+        self.folder = cache / self._calc_hash() if cache is not None and machine is None else None
+
+    def _calc_hash(self) -> str:
+        """Return what everything that is learned depends on, as 16 digits."""
+        packages = ("drakerock", "numpy", "scipy", "scikit-learn", "pymoo")
+        known = [
+            self.learned_from, str(self.seed), *map(version, packages),
+            *(hashlib.sha256(np.ascontiguousarray(getattr(self.data, name)).tobytes()).hexdigest()
+              for name in ("following", "features", "loading")),
+            *self.data.point.tolist(),
+        ]  # fmt: skip
+        return calc_config_hash(self.data.scenario, *known)
 
     def make_grid(self, field: HeightField, scenario: Scenario) -> PileGrid:
         """Return the grid of a field, and where the machine can enter on it."""
@@ -173,7 +218,7 @@ class LoaderModel:
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()[:16]
 
-    @cached_property
+    @_Learned
     def surrogate(self) -> Surrogate:
         """The exploration's surrogate, fitted to the means over each point's loadings.
 
@@ -190,7 +235,7 @@ class LoaderModel:
         )  # fmt: skip
         return fit_surrogate(table, seed=self.seed)
 
-    @cached_property
+    @_Learned
     def front(self) -> ParetoFront:
         """Its Pareto front: of fixed strategies."""
         return pareto_front(self.surrogate, config=_FRONT, seed=self.seed)
@@ -203,32 +248,32 @@ class LoaderModel:
         spread = np.maximum(np.abs(self.front.nadir - self.front.ideal), least)
         return CostScale(self.problem, self.front.ideal, self.front.ideal + self.problem.signs * spread)
 
-    @cached_property
+    @_Learned
     def encoder(self) -> PileEncoder:
         """Codes of height fields."""
         return PileEncoder().fit(self.data.before)
 
-    @cached_property
+    @_Learned
     def hazard_limits(self) -> HazardLimits:
         """From when on something is a hazard: what is usual in the study is none."""
         return calibrate_limits(self.grid, self.data.before, self.machine.width)
 
-    @cached_property
+    @_Learned
     def novelty(self) -> Novelty:
         """How unlike the training set a pile is."""
         return Novelty(self.data, self.encoder, self.seed)
 
-    @cached_property
+    @_Learned
     def feature_outcome(self) -> FeatureOutcome:
         """The first rung: features of the pile."""
         return FeatureOutcome(self.data, self.grid, self.seed)
 
-    @cached_property
+    @_Learned
     def field_outcome(self) -> FieldOutcome:
         """The second rung: the height field."""
         return fit_field_outcome(self.data, self.grid, self.encoder, self.gamma, self.seed)
 
-    @cached_property
+    @_Learned
     def pile_model(self) -> PileModel:
         """The pile after."""
         return PileModel(self.data, self.grid, self.encoder, self.gamma, self.seed)
@@ -252,10 +297,12 @@ class LoaderModel:
 def load_model(source: str | Path, seed: int = 0) -> LoaderModel:
     """Return the model that the loadings of a study teach, see `read_loading_data`.
 
+    What is learned is kept in the user's cache.
+
     Raises:
         InputError: see `read_loading_data` and `LoaderModel`.
     """
-    return LoaderModel(read_loading_data(source), seed)
+    return LoaderModel(read_loading_data(source), seed, cache=user_cache_path("drakerock") / "loaders")
 
 
 def measure_machine(scenario: Scenario) -> DiggingMachine:

@@ -1,9 +1,9 @@
 """What a finished (or running) study says: report, confirmation, strategy.
 
 A source is a study folder, whose store is exported first; or a folder with a table (`responses.parquet` or
-`responses.csv`) and, where there is one, `study.json` beside it; or such a table alone. `FULL_SIZE` is shipped. Of `study.json`, `problem`
-(variables and objectives), `exploration` (settings, an `ExplorationConfig`) and `seed` are used, and all of it is
-shown in the report.
+`responses.csv`) and, where there is one, `study.json` beside it; or such a table alone. `FULL_SIZE` is shipped. Of
+`study.json`, `problem` (variables and objectives), `exploration` (settings, an `ExplorationConfig`) and `seed` are
+used, and all of it is shown in the report.
 """
 
 from __future__ import annotations

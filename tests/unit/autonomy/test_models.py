@@ -4,16 +4,21 @@ Caught: regression with one correlation length for all inputs, worse than a surr
 front that is all but a point, on which a hair of an objective decided.
 """
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from drakerock.autonomy import model as loader_model
 from drakerock.autonomy.encoding import PileEncoder
 from drakerock.autonomy.entry import calc_entry_features, calc_profiles, choose_slices
+from drakerock.autonomy.model import CHOICES, LoaderModel
 from drakerock.autonomy.outcome_models import BlindOutcome, fit_field_outcome
+from drakerock.autonomy.preference import Preference
 from drakerock.autonomy.regression import LandmarkRegressor, find_theta
 from drakerock.errors import InputError
+from drakerock.loading.config import StrategyConfig
 from drakerock.loading.field import HeightField, calc_pile_profile
 from drakerock.loading.planning import choose_entry_slice
 from tests.unit.autonomy.synthetic import CELL, HALF_ROOM, World, X, Y, make_data
@@ -181,3 +186,77 @@ def test_novelty_knows_its_own_and_not_the_others(model):
     assert model.novelty.calc(steep) > 1.0
     assert model.novelty.calc(rough) > 1.0
     assert model.novelty.calc(np.zeros((len(X), len(Y)))) > 1.0
+
+
+PARTS = (
+    "surrogate",
+    "front",
+    "encoder",
+    "hazard_limits",
+    "novelty",
+    "feature_outcome",
+    "field_outcome",
+    "pile_model",
+)
+
+
+@pytest.fixture(scope="module")
+def few():
+    return make_data(n_points=14, n_loadings=3)
+
+
+@pytest.fixture(scope="module")
+def cache(few, tmp_path_factory):
+    """Where a model has kept all that it has learned."""
+    cache = tmp_path_factory.mktemp("cache")
+    learned = LoaderModel(few, cache=cache)
+    for name in PARTS:
+        getattr(learned, name)
+    assert sorted(path.stem for path in learned.folder.iterdir()) == sorted(PARTS)
+    return cache
+
+
+def test_what_is_kept_advises_the_same_and_is_not_learned_again(few, cache, monkeypatch):
+    fresh, kept = LoaderModel(few), LoaderModel(few, cache=cache)
+    wanted = Preference((("production", 0.6), ("damage", 0.4)))
+    field = few.get_field(5)
+    chosen = {}
+    for name in CHOICES:
+        choice = fresh.make_choice(name, StrategyConfig())
+        chosen[name] = choice.choose(fresh.look_at(field, few.scenario), wanted).x
+    for function in (
+        "fit_surrogate",
+        "pareto_front",
+        "fit_field_outcome",
+        "FeatureOutcome",
+        "PileModel",
+        "Novelty",
+    ):
+        monkeypatch.setattr(loader_model, function, lambda *_args, **_kwargs: pytest.fail("learned again"))
+    for name in CHOICES:
+        choice = kept.make_choice(name, StrategyConfig())
+        np.testing.assert_array_equal(
+            choice.choose(kept.look_at(field, few.scenario), wanted).x, chosen[name], err_msg=name
+        )
+
+
+def test_other_data_and_another_seed_have_folders_of_their_own(few, cache):
+    one = LoaderModel(few, cache=cache).folder
+    assert LoaderModel(few, cache=cache).folder == one
+    assert LoaderModel(few, seed=1, cache=cache).folder != one
+    assert LoaderModel(few.take(np.arange(len(few)) > 0), cache=cache).folder != one
+    assert LoaderModel(replace(few, following=few.following + 0.01), cache=cache).folder != one
+    steeper = few.scenario.replace(**{"rocks.friction": 0.7})
+    assert LoaderModel(replace(few, scenario=steeper), cache=cache).folder != one
+
+
+def test_a_damaged_file_is_learned_and_kept_anew(few, cache, tmp_path):
+    place = shutil.copytree(cache, tmp_path / "cache")
+    model = LoaderModel(few, cache=place)
+    path = model.folder / "surrogate.joblib"
+    path.write_bytes(path.read_bytes()[:100])
+    X = few.X[:3]
+    np.testing.assert_array_equal(
+        model.surrogate.predict(X), LoaderModel(few, cache=cache).surrogate.predict(X)
+    )
+    assert path.stat().st_size > 100
