@@ -11,7 +11,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-_PLAIN_INTERVAL = 30.0
+# Seconds between updates of a live table, and between plain lines.
+_LIVE_INTERVAL, _PLAIN_INTERVAL = 1.0, 30.0
 
 
 class Display:
@@ -24,7 +25,7 @@ class Display:
     def __init__(self, console: Console) -> None:
         self._console = console
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
-        self._printed = -1e9
+        self._shown = -1e9
 
     def __enter__(self) -> Self:
         if self._live:
@@ -37,12 +38,17 @@ class Display:
         if self._live:
             self._live.stop()
 
-    def update(self, status: dict[str, Any], last: bool = False) -> None:
-        """Show the status; plain lines come every half minute, and at the last."""
+    def is_due(self) -> bool:
+        """Return whether it is time for an update: a table's every second, plain lines every half minute."""
+        interval = _LIVE_INTERVAL if self._live else _PLAIN_INTERVAL
+        return time.monotonic() - self._shown >= interval
+
+    def update(self, status: dict[str, Any]) -> None:
+        """Show the status."""
+        self._shown = time.monotonic()
         if self._live:
             self._live.update(make_status_table(status), refresh=True)
-        elif last or time.monotonic() - self._printed >= _PLAIN_INTERVAL:
-            self._printed = time.monotonic()
+        else:
             self.say(make_status_line(status))
 
     def say(self, text: str) -> None:

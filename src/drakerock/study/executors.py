@@ -25,13 +25,14 @@ from drakerock.study.worker_setup import silence_closing
 
 # One thread each: the simulation is sequential, and there is a process for every core.
 THREADS = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-# Dask looks at what its workers do a hundred times a second, and at its event loops fifty times: together a tenth
-# of a core for each worker that is busy with a single task for minutes.
+# Dask looks at what its workers do a hundred times a second, at its event loops fifty times, at their memory ten times:
+# together a tenth of a core for each worker that is busy with a single task for minutes.
 # A scheduler of ours never tries the task of a dead worker on others by itself: the runner does that, and counts.
 SCHEDULER = {"distributed.scheduler.allowed-failures": 0}
 DASK = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500ms",
+    "distributed.worker.memory.monitor-interval": "1s",
     "distributed.admin.system-monitor.interval": "5s",
 }
 

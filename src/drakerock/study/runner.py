@@ -76,7 +76,7 @@ def run_study(
         finally:
             status = read_status(store)
             if display:
-                display.update(status, last=True)
+                display.update(status)
     export_tables(folder)
     return status
 
@@ -91,7 +91,6 @@ class _Runner:
         self._running: dict[str, _Sequence] = {}
         self._lost: deque[_Sequence] = deque()
         self._stop_file = store.folder / f".stop-{time.time_ns()}"
-        self._shown = -1e9
         self._changed = True
 
     def run(self, workers: int | None, scheduler: str | None) -> None:
@@ -243,8 +242,7 @@ class _Runner:
         """Record the cycles that have been finished since the last look, and show them."""
         for sequence in self._running.values():
             self._record(sequence)
-        if self._display and time.monotonic() - self._shown > 1.0:
-            self._shown = time.monotonic()
+        if self._display and self._display.is_due():
             self._display.update(read_status(self._store))
 
     def _record(self, sequence: _Sequence) -> None:
