@@ -1,6 +1,6 @@
-"""Cut a finished study down to the data that the notebooks are shown with: its tables, and one thinned cycle.
+"""Cut a loading of a study down to the data that `read_cycle.ipynb` is shown with.
 
-The shipped data are of `studies/reduced.yaml` in short (28 + 6 points of 2 loadings, everything kept):
+They are of `studies/reduced.yaml` in short (28 + 6 points of 2 loadings, everything kept):
 
     drakerock study run studies/reduced.yaml --out out/short --set loadings=2 --set storage.keep=everything \
         --set exploration.sampling.n_initial=16 --set exploration.sampling.n_corners=8 \
@@ -18,11 +18,9 @@ EVERY = 4  # steps, of 0.01 s
 
 
 def main() -> None:
-    study, cycle = Path(sys.argv[1]), Path(sys.argv[1], sys.argv[2])
+    cycle = Path(sys.argv[1], sys.argv[2])
     data = Path(__file__).with_name("data")
     (data / "cycle").mkdir(parents=True, exist_ok=True)
-    for name in ("responses.csv", "study.json"):
-        shutil.copy(study / name, data)
     for name in ("outcome.json", "plan.json", "scenario.json"):
         shutil.copy(cycle / name, data / "cycle")
     columns, units = load_signals(cycle / "signals.parquet")

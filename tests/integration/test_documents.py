@@ -114,11 +114,11 @@ WITH_BLOCKS = sorted({block.document for block in BLOCKS if not block.language.s
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     """A folder that looks like the checkout, with what documents say has been there before."""
-    for name in ("examples", "src", "studies"):
+    for name in ("docs", "examples", "src", "studies"):
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(ROOT))
-    shutil.copytree(ROOT / "notebooks" / "data", "out/paper", ignore=shutil.ignore_patterns("cycle"))
+    shutil.copytree(ROOT / "studies" / "full_size", "out/paper")
     # A measured pile, its alignment, measured curves.
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-4.0, 0.9, 12_000), rng.uniform(-2.8, 2.8, 12_000)

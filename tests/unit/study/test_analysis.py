@@ -250,3 +250,15 @@ def test_a_surrogate_of_something_else_is_not_taken(reported, tmp_path, monkeypa
     monkeypatch.setattr(analysis, "fit_surrogate", lambda *args: fits.append(args) or fit(*args))
     run_strategy(place)
     assert len(fits) == 1
+
+
+def test_the_shipped_study_answers_without_a_source_and_a_fit(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(analysis, "fit_surrogate", lambda *_: pytest.fail("fitted"))
+    result = run("strategy", "--weights", "production=0.6,damage=0.2,debris=0.2", "--json")
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert list(told["strategy"]) == ["alpha", "beta", "gamma", "kappa"]
+    # A loaded LHD of 21 t brings hundreds of kilograms a second, not tens or thousands.
+    assert 200.0 < told["objectives"]["production"] < 1500.0
+    assert set(told["verdict"]["objectives"]) == {"production", "damage", "debris"}
