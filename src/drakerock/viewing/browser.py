@@ -50,6 +50,8 @@ class Page:
         return base64.b64decode(reply["data"])
 
     async def _open(self, address: str) -> None:
+        own = ("data:", "blob:", address if address.startswith("http:") else "file:")
+
         async def note_console(message: Any) -> None:
             details = message["params"]
             if details["type"] in ("error", "warning", "assert"):
@@ -66,7 +68,7 @@ class Page:
 
         async def note_request(message: Any) -> None:
             url = message["params"]["request"]["url"]
-            if not url.startswith(("file:", "data:", "blob:")):
+            if not url.startswith(own):
                 self.faults.append(f"asks for {url}")
 
         for event, note in (
@@ -80,7 +82,7 @@ class Page:
             await self._send(f"{domain}.enable")
         await self._send(
             "Network.emulateNetworkConditions",
-            offline=True,
+            offline=address.startswith("file:"),
             latency=0,
             downloadThroughput=0,
             uploadThroughput=0,
@@ -101,11 +103,11 @@ def _describe(details: dict[str, Any]) -> str:
 
 
 @contextlib.asynccontextmanager
-async def open_page(path: Path, width: int = 1280, height: int = 720) -> AsyncIterator[Page]:
+async def open_page(page: Path | str, width: int = 1280, height: int = 720) -> AsyncIterator[Page]:
     """Open an HTML file in a browser of its own, without a network, until the context ends.
 
     Args:
-        path: the file.
+        page: the file; or the address of a server of one's own, http:, which alone is asked then.
         width, height: of the window [pixels].
 
     Raises:
@@ -128,9 +130,9 @@ async def open_page(path: Path, width: int = 1280, height: int = 720) -> AsyncIt
             + ": install it (apt install chromium; or choreo_get_chrome), or name it in BROWSER_PATH"
         ) from None
     try:
-        page = Page(await browser.create_tab("about:blank"))
-        await page.resize(width, height)
-        await page._open(path.resolve().as_uri())
-        yield page
+        tab = Page(await browser.create_tab("about:blank"))
+        await tab.resize(width, height)
+        await tab._open(page if isinstance(page, str) else page.resolve().as_uri())
+        yield tab
     finally:
         await browser.close()

@@ -1,8 +1,6 @@
 """The preview of a strategy: its plan, a prediction with its verdict, and a page that shows both."""
 
 import json
-import shutil
-import subprocess
 import threading
 import urllib.error
 import urllib.request
@@ -10,7 +8,6 @@ import urllib.request
 import numpy as np
 import pytest
 
-from drakerock.config import parse_config
 from drakerock.errors import InputError
 from drakerock.exploration.problem import Problem
 from drakerock.exploration.problems import make_noisy_table
@@ -22,6 +19,7 @@ from drakerock.loading.scenario import Scenario
 from drakerock.loading.sensing import make_grid
 from drakerock.study.preview import Preview
 from drakerock.study.preview_server import make_server
+from tests.browsers import act, visit
 
 
 @pytest.fixture(scope="module")
@@ -130,16 +128,50 @@ def test_the_server_answers_plans_and_refuses_the_rest(address, preview):
         fetch(f"{address}other")
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="no browser on this machine")
-def test_the_page_shows_the_plan_in_a_browser(address, preview, tmp_path):
-    command = [
-        "chromium", "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
-        "--disable-component-update", "--disable-sync", f"--user-data-dir={tmp_path}", "--enable-logging=stderr",
-        "--virtual-time-budget=8000", "--dump-dom", address,
-    ]  # fmt: skip
-    result = subprocess.run(command, capture_output=True, text=True, timeout=90)
-    assert [line for line in result.stderr.splitlines() if "CONSOLE" in line] == []
-    data = preview.describe(parse_config("{}", StrategyConfig)).to_dict()
-    assert f"{data['plan']['volume_m3']:.2f} / {data['plan']['volume_wanted_m3']:.2f} m³" in result.stdout
-    assert data["predicted"]["verdict"]["title"] in result.stdout
-    assert result.stdout.count("<circle") == 5
+LOOK = """(async () => {
+  while (busy) await new Promise((done) => setTimeout(done, 20));
+  const text = (id) => document.getElementById(id).textContent;
+  const rows = (id) => Object.fromEntries(
+    [...document.querySelectorAll(`#${id} tr`)].map((r) => [...r.cells].map((c) => c.textContent)));
+  return { numbers: rows("numbers"), predicted: rows("predicted"), verdict: text("verdict"), message: text("message"),
+    circles: document.querySelectorAll("circle").length,
+    values: [...document.querySelectorAll("#sliders b")].map((b) => Number(b.textContent)),
+    swept: document.querySelectorAll("#side polygon").length, cells: document.querySelectorAll("#top rect").length };
+})()"""
+
+
+def slide(name, value):
+    return act(f"#sliders input[name={name}]", "input", value)
+
+
+def test_the_page_shows_the_plan_and_its_sliders_act(address, preview):
+    strategies = {
+        "first": preview.scenario.loading.strategy,
+        "moved": StrategyConfig(alpha=0.5, beta=0.9, gamma=0.2, kappa=0.4),
+        "greedy": StrategyConfig(alpha=2.0, beta=0.0, gamma=0.2, kappa=0.4),
+    }
+    steps = {
+        "first": "",
+        "moved": "".join(slide(name, value) for name, value in strategies["moved"].model_dump().items()),
+        "greedy": slide("alpha", 2.0) + slide("beta", 0.0),
+    }
+    seen = visit(address, steps, LOOK, ready="document.body.dataset.shown")
+    assert seen["faults"] == []
+    for name, strategy in strategies.items():
+        data, shown = preview.describe(strategy).to_dict(), seen[name]
+        plan, predicted = data["plan"], data["predicted"]
+        assert shown["values"] == pytest.approx(list(strategy.model_dump().values()), abs=0.006)
+        assert (
+            shown["numbers"]["cut / wanted"] == f"{plan['volume_m3']:.2f} / {plan['volume_wanted_m3']:.2f} m³"
+        )
+        assert shown["numbers"]["push"] == f"{plan['depth_m']:.2f} m"
+        assert shown["numbers"]["slope at the entry"] == f"{plan['slope_deg']:.0f}°"
+        assert bool(shown["message"]) == (not plan["volume_reached"])
+        assert predicted["verdict"]["title"] in shown["verdict"]
+        for objective, value in predicted["objectives"].items():
+            if value is None:
+                assert shown["predicted"][objective] == "not known"
+            else:
+                assert float(shown["predicted"][objective].split(" ± ")[0]) == pytest.approx(value, rel=1e-3)
+        assert (shown["circles"], shown["swept"]) == (5, 2)
+        assert shown["cells"] > 100

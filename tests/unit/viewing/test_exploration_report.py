@@ -1,7 +1,5 @@
 import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -33,6 +31,7 @@ from drakerock.viewing.exploration_figures import (
     make_figures,
 )
 from drakerock.viewing.report import make_report, write_report
+from tests.browsers import act, visit
 
 QUICK = ExplorationConfig(
     surrogate=SurrogateConfig(n_starts=4),
@@ -159,45 +158,82 @@ def test_equal_explorations_give_equal_bytes(exploration, written, tmp_path):
         assert first.read_bytes() == second.read_bytes(), first.name
 
 
-def find_browser():
-    return next(
-        (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))),
-        None,
-    )
+# What the page shows: the strategy beside the sliders, the front points within the bounds, what is drawn.
+LOOK = """({
+  index: Number(document.getElementById("shown").dataset.index),
+  name: document.getElementById("shown-name").textContent,
+  rows: Object.fromEntries(
+    [...document.querySelectorAll("#shown tr")].map((r) => [...r.cells].map((c) => c.textContent))),
+  inside: document.getElementById("inside").textContent,
+  weights: [...document.querySelectorAll("#weights label")].map((l) => l.lastElementChild.textContent),
+  bounds: [...document.querySelectorAll("#bounds label")].map((l) => l.lastElementChild.textContent),
+  projections: document.querySelectorAll("#explorer .cartesianlayer .subplot").length,
+  pictures: [...document.images].filter((i) => i.naturalWidth > 100).length,
+  links: [...document.querySelectorAll("nav a")].filter((a) => !document.querySelector(a.getAttribute("href"))).length,
+})"""
 
 
-MOVE_A_BOUND = """<script>
-const slider = document.querySelectorAll("#bounds input")[2];
-slider.value = 0.3;
-slider.dispatchEvent(new Event("input"));
-</script></body>"""
+def slide(box, j, value):
+    return act(f"#{box} label:nth-child({j + 1}) input", "input", value)
 
 
-@pytest.mark.skipif(find_browser() is None, reason="no browser on this machine")
-@pytest.mark.parametrize("bounded", [False, True])
-def test_page_runs_in_a_browser_without_errors(written, exploration, tmp_path, bounded):
-    """The console stays free, and the page's own choice by weights and bounds is that of choose_strategy."""
-    front, page, bounds = exploration.front, tmp_path / "page.html", []
-    text = written[0].read_text(encoding="utf-8")
-    if bounded:
-        text = text.replace("</body>", MOVE_A_BOUND)
-        value = float(f"{front.ideal[2] + 0.3 * (front.nadir[2] - front.ideal[2]):.3g}")
+@pytest.fixture(scope="module")
+def seen(written):
+    """What a visit of the page shows."""
+    steps = {
+        "first": "",
+        "production": slide("weights", 0, 1.0) + slide("weights", 1, 0.0) + slide("weights", 2, 0.0),
+        "uneven": slide("weights", 0, 0.6) + slide("weights", 1, 0.2) + slide("weights", 2, 0.2),
+        "bounded": slide("bounds", 2, 0.3),
+        "impossible": "".join(slide("bounds", j, 0.0) for j in range(3)),
+        "clicked": "plot.emit('plotly_click', {points: [{customdata: points.findIndex((p) => p.replay)}]})",
+    }
+    return visit(written[0], steps, LOOK)
+
+
+def test_page_opens_without_faults(seen, exploration):
+    assert seen["faults"] == []
+    assert seen["first"]["projections"] == 3
+    assert seen["first"]["pictures"] >= 8
+    assert seen["first"]["links"] == 0, "the page's own links lead somewhere"
+
+
+@pytest.mark.parametrize(
+    ("step", "weights", "bound"),
+    [
+        ("first", (1.0, 1.0, 1.0), None),
+        ("production", (1.0, 0.0, 0.0), None),
+        ("uneven", (0.6, 0.2, 0.2), None),
+        ("bounded", (0.6, 0.2, 0.2), 0.3),
+    ],
+)
+def test_sliders_choose_as_choose_strategy_does(seen, exploration, step, weights, bound):
+    front, problem, bounds = exploration.front, KNOWN.problem, []
+    if bound is not None:
+        value = float(f"{front.ideal[2] + bound * (front.nadir[2] - front.ideal[2]):.3g}")
         bounds = [Bound(objective="debris", relation="<=", value=value)]
-    page.write_text(text, encoding="utf-8")
-    command = [
-        find_browser(), "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
-        "--disable-component-update", "--disable-sync", f"--user-data-dir={tmp_path / 'browser'}",
-        "--enable-logging=stderr",
-        "--virtual-time-budget=5000", "--dump-dom", page.as_uri(),
-    ]  # fmt: skip
-    result = subprocess.run(command, capture_output=True, text=True, timeout=90)
-    console = [line for line in result.stderr.splitlines() if "CONSOLE" in line]
-    assert console == []
-    expected = choose_strategy(front, dict.fromkeys(KNOWN.problem.objective_names, 1.0), bounds)
-    shown = re.search(r'id="shown" data-index="(\d+)"', result.stdout)
-    assert shown
-    assert int(shown[1]) == expected.index
-    assert "main-svg" in result.stdout, "plotly drew the projections"
+        assert float(seen[step]["bounds"][2]) == value
+    chosen = choose_strategy(front, dict(zip(problem.objective_names, weights, strict=True)), bounds)
+    assert seen[step]["index"] == chosen.index
+    assert [float(text) for text in seen[step]["weights"]] == pytest.approx(
+        np.array(weights) / sum(weights), abs=0.006
+    )
+    for variable, x in zip(problem.variables, chosen.x, strict=True):
+        assert float(seen[step]["rows"][f"{variable.name} ({variable.label})"]) == pytest.approx(x, abs=6e-4)
+    for objective, y in zip(problem.objectives, chosen.y, strict=True):
+        assert float(seen[step]["rows"][objective.name].split(" ± ")[0]) == pytest.approx(y, rel=6e-4)
+
+
+def test_bounds_that_nothing_keeps_are_said(seen):
+    assert "No front point keeps these bounds" in seen["impossible"]["inside"]
+    assert re.fullmatch(r"\d+ of \d+ front points keep the bounds\.", seen["bounded"]["inside"])
+
+
+def test_a_point_that_is_clicked_is_shown_with_its_replay(seen, exploration):
+    assert seen["clicked"]["name"] == f"sample {exploration.table.point[0]}"
+    assert seen["clicked"]["rows"]["replay"] == "open"
+    shown = float(seen["clicked"]["rows"]["production"].split(" ± ")[0])
+    assert shown == pytest.approx(exploration.table.Y[0, 0], rel=6e-4)
 
 
 @pytest.mark.parametrize(("d", "k"), [(1, 1), (2, 1), (3, 4), (10, 2)])

@@ -16,7 +16,7 @@ from drakerock.viewing.replay import write_comparison, write_replay
 from drakerock.viewing.results import make_results
 from drakerock.viewing.scene_figures import calc_rock_poses
 from drakerock.viewing.stored_cycle import load_cycle
-from tests.browsers import need_browser
+from tests.browsers import act, need_browser
 from tests.cycle_files import write_cycle
 
 SEEN = ("load", "payload_share", "push", "down", "hinge", "speed", "slip", "wheels", "boom", "bucket")
@@ -35,14 +35,6 @@ LOOK = """(() => {
     eye: scene.viewer.camera.position.toArray(), wall: scene.wall.material.opacity, playing: replay.playing,
     faults: document.querySelectorAll(".fault").length };
 })()"""
-
-
-def act(element, event, value=None):
-    """JavaScript that does what a user would do to an element."""
-    assign = f"e.value = {value}; " if value is not None else ""
-    return (
-        f"{{ const e = document.querySelector('{element}'); {assign}e.dispatchEvent(new Event('{event}')); }}"
-    )
 
 
 @pytest.fixture(scope="module")

@@ -58,7 +58,7 @@ def write_machine_page(config: MachineConfig, path: str | Path, *, contact_shape
     wheels = [plant.GetJointByName(joint, machine.instance) for joint in names.WHEEL_JOINTS]
     eye = 2.2 * (kin.boom_length + kin.bucket_length)
     meshcat.SetCameraPose(
-        np.array([0.65 * eye, 0.6 * eye, 0.35 * eye]), np.array([-0.1 * eye, 0.0, 0.08 * eye])
+        np.array([0.36 * eye, -0.64 * eye, 0.28 * eye]), np.array([-0.14 * eye, 0.0, 0.22 * eye])
     )
 
     visualizer.StartRecording(set_transforms_while_recording=False)
@@ -68,7 +68,8 @@ def write_machine_page(config: MachineConfig, path: str | Path, *, contact_shape
             wheel.set_angle(context, x / kin.wheel_radius)
         X_WF = RigidTransform(np.array([x, 0.0, kin.wheel_radius]))
         plant.SetFreeBodyPose(context, front, X_WF)
-        root.SetTime(k / _FRAMES_PER_SECOND)
+        # Meshcat rounds a time down to a frame: without the hair, k / 25 may come out as the frame before.
+        root.SetTime((k + 1e-6) / _FRAMES_PER_SECOND)
         diagram.ForcedPublish(root)
     visualizer.StopRecording()
     visualizer.PublishRecording()
