@@ -61,19 +61,31 @@ class _Learned(cached_property):  # type: ignore[type-arg]
     """A part of the model that takes long to learn: kept in the model's folder, where it has one."""
 
     def __get__(self, model: Any, owner: Any = None) -> Any:
-        if model is None or self.attrname in vars(model) or model.folder is None:
+        if model is None or self.attrname in vars(model):
             return super().__get__(model, owner)
-        path = model.folder / f"{self.attrname}.joblib"
+        path = None if model.folder is None else model.folder / f"{self.attrname}.joblib"
+        if path is None or not self._read(model, path):
+            part = super().__get__(model, owner)
+            if path is not None and self._write(part, path):
+                # Arrays that were read may lie otherwise in memory, and sums over them differ in the last bit: who
+                # learns goes on with what the next one will read.
+                self._read(model, path)
+        return vars(model)[self.attrname]
+
+    def _read(self, model: Any, path: Path) -> bool:
         with suppress(Exception):  # missing, or damaged: whatever unpickling then raises
             vars(model)[self.attrname] = joblib.load(path)
-            return vars(model)[self.attrname]
-        part = super().__get__(model, owner)
+            return True
+        return False
+
+    def _write(self, part: Any, path: Path) -> bool:
         with suppress(OSError):  # no room, no permission: it is learned again next time
             path.parent.mkdir(parents=True, exist_ok=True)
             partial = path.with_suffix(f".{os.getpid()}")
             joblib.dump(part, partial)
             partial.replace(path)
-        return part
+            return True
+        return False
 
 
 class LoaderModel:

@@ -216,14 +216,16 @@ def cache(few, tmp_path_factory):
     return cache
 
 
-def test_what_is_kept_advises_the_same_and_is_not_learned_again(few, cache, monkeypatch):
-    fresh, kept = LoaderModel(few), LoaderModel(few, cache=cache)
+def test_what_is_kept_advises_the_same_and_is_not_learned_again(few, cache, tmp_path, monkeypatch):
+    """To the last bit: who learned and who reads see the same arrays."""
+    fresh, kept = LoaderModel(few, cache=tmp_path), LoaderModel(few, cache=cache)
     wanted = Preference((("production", 0.6), ("damage", 0.4)))
     field = few.get_field(5)
     chosen = {}
     for name in CHOICES:
         choice = fresh.make_choice(name, StrategyConfig())
         chosen[name] = choice.choose(fresh.look_at(field, few.scenario), wanted).x
+    novelty = [fresh.novelty.calc(h) for h in few.before]
     for function in (
         "fit_surrogate",
         "pareto_front",
@@ -238,6 +240,7 @@ def test_what_is_kept_advises_the_same_and_is_not_learned_again(few, cache, monk
         np.testing.assert_array_equal(
             choice.choose(kept.look_at(field, few.scenario), wanted).x, chosen[name], err_msg=name
         )
+    assert [kept.novelty.calc(h) for h in few.before] == novelty
 
 
 def test_other_data_and_another_seed_have_folders_of_their_own(few, cache):
