@@ -124,4 +124,3 @@ def test_shipped_studies_can_be_read(name):
             "slip_control": 200,
         }[name]
     )
-    assert find_data("studies", f"{name}.py").exists()
