@@ -212,16 +212,22 @@ def test_two_loadings_are_compared(place, sequence):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["compare", "nowhere", "nowhere"], "nowhere/plan.json: no such file"),
+        (["compare", "nowhere", "nowhere"], "nowhere: no finished loading here"),
+        (["replay", "."], "no finished loading here (outcome.json is missing)"),
+        (["replay", "file"], "file: no finished loading here"),
         (["film", "nowhere", "--size", "wide"], "--size wide: width x height"),
-        (["film", "nowhere", "--out", "film.gif"], "nowhere/plan.json: no such file"),
+        (["film", "nowhere", "--out", "frames"], "nowhere: no finished loading here"),
+        (["film", "nowhere", "--out", "film.mp4"], "nowhere: no finished loading here"),
+        (["film", "nowhere", "--out", "film.gif"], "nowhere: no finished loading here"),
     ],
 )
 def test_what_cannot_be_shown_is_said(tmp_path, monkeypatch, args, message):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
     result = CliRunner().invoke(app, args)
     assert isinstance(result.exception, InputError)
     assert message in str(result.exception)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_json_prints_only_json_and_the_same_cycle_again(place, loaded):
@@ -278,7 +284,7 @@ def test_pile_command(place, run):
         ),
         (["load", "small.yaml", "--set", "foo.bar=1"], ["override: unknown key 'foo'"]),
         (["load", "."], ["cannot be read: Is a directory"]),
-        (["replay", "nowhere"], ["nowhere", "no such file"]),
+        (["replay", "nowhere"], ["nowhere", "no finished loading here"]),
         (["machine", "check", "bad.yaml"], ["bad.yaml:2", "drift_widht"]),
     ],
 )

@@ -57,6 +57,9 @@ NOT_RUN = {
         "docs/autonomy.md",
         "nice python benchmarks/autonomy.py run out/full_size --out out/autonomy --loadings 15",
     ): "a day of CPU time; tests/unit/autonomy/test_benchmark.py runs the parts of it",
+    ("docs/machine.md", "python benchmarks/walls.py run out/walls"): (
+        "two loadings at full size; tests/unit/loading/test_walls.py holds its geometry to closed forms"
+    ),
     ("docs/validation/motors.md", "for d in 1e7 1e8 1e9 1e10; do for s in 1 2 3; do"): (
         "a loop of twelve loadings; test_the_commands_in_the_documentation_are_valid reads its command"
     ),

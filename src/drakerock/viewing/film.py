@@ -65,9 +65,10 @@ def write_film(
     if settings.width % 2 or settings.height % 2:
         raise InputError(f"a film's width and height are even, not {settings.width}x{settings.height}")
     writers: dict[str, Callable[[Path, FilmSettings], Any]] = {"": _Pictures, ".mp4": _Mp4, ".gif": _Gif}
-    writer = writers[path.suffix](path, settings)
     with tempfile.TemporaryDirectory() as place:
         page = write_replay(folder, Path(place) / "replay.html")
+        # ffmpeg starts with its writer: not before the loading has been read.
+        writer = writers[path.suffix](path, settings)
         try:
             asyncio.run(_film(page, writer, settings, progress or (lambda _share: None)))
         except OSError as error:

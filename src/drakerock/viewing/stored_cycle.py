@@ -50,9 +50,13 @@ def load_cycle(folder: str | Path) -> StoredCycle:
     """Read what `drakerock load` wrote.
 
     Raises:
-        InputError: a file is missing or cannot be read.
+        InputError: it is no folder of a finished loading; a file is missing or cannot be read.
     """
     folder = Path(folder)
+    if not (folder / OUTCOME).is_file():
+        raise InputError(
+            f"{folder}: no finished loading here ({OUTCOME} is missing); make one with `drakerock load`"
+        )
     plan, field = load_plan(folder / PLAN)
     signals, _ = load_signals(folder / SIGNALS)
     return StoredCycle(
