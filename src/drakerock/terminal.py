@@ -117,14 +117,20 @@ def print_outcome(outcome: Any) -> None:
 
     table.add_row("strategy", "  ".join(f"{key} {value:g}" for key, value in s.items()))
     table.add_row("ended", f"{outcome.status}: {outcome.reason}")
+    # First what a mine reads first.
+    mining = dict(describe_mining(outcome.mining or {}))
+    for label in ("load", "fill factor"):
+        table.add_row(label, mining.pop(label))
+    table.add_row("loading time t4 - t0", show(outcome.loading_time_s, "{:.2f} s"))
     table.add_row("production", show(outcome.objectives["production"], "{:.0f} kg/s"))
     table.add_row("damage", show(outcome.objectives["damage"], "{:.4f}"))
     table.add_row("debris", show(outcome.objectives["debris"], "{:.0f} kg"))
+    for label, text in mining.items():
+        table.add_row(label, text)
     mass = show(outcome.bucket_mass_kg, "{:.0f} kg")
-    table.add_row("bucket load", f"{mass} in {show(outcome.bucket_rocks, '{:d}')} rocks")
+    table.add_row("rocks in the bucket", f"{show(outcome.bucket_rocks, '{:d}')}, {mass}")
     counted = show(outcome.counted_when_weighed_kg, "{:.0f} kg")
     table.add_row("weighed", f"{show(outcome.weighed_mass_kg, '{:.0f} kg')} (counted then: {counted})")
-    table.add_row("loading time t4 - t0", show(outcome.loading_time_s, "{:.2f} s"))
     table.add_row("t0 ... t4", "  ".join(show(t, "{:.2f}") for t in outcome.waypoint_times_s) + " s")
     if "volume_m3" in outcome.plan:
         plan = outcome.plan
@@ -133,8 +139,6 @@ def print_outcome(outcome: Any) -> None:
     table.add_row("push force mean, peak", f"{show(_kilo(outcome.mean_push_force_N), '{:.0f}')}, "
                   f"{show(_kilo(outcome.peak_push_force_N), '{:.0f}')} kN")  # fmt: skip
     table.add_row("motors' work", show(_kilo(outcome.energy_J), "{:.0f} kJ"))
-    for label, text in describe_mining(outcome.mining or {}):
-        table.add_row(label, text)
     events = ", ".join(f"{item['event']} at {item['time_s']:.2f} s" for item in outcome.events) or "none"
     table.add_row("events", events)
     rocks = outcome.rocks
@@ -160,15 +164,15 @@ def print_sequence(summary: dict[str, Any]) -> None:
     title = f"{summary['loadings']} loadings, {strategy}"
     table = Table(title=title, title_justify="left", expand=True)
     rows = {
+        "bucket_mass_kg": ("bucket load [kg]", "{:.0f}"),
+        "payload_percent": ("payload [%]", "{:.1f}"),
+        "fill_factor": ("fill factor", "{:.2f}"),
+        "loading_time_s": ("loading time [s]", "{:.2f}"),
         "production": ("production [kg/s]", "{:.0f}"),
         "damage": ("damage", "{:.4f}"),
         "debris": ("debris [kg]", "{:.0f}"),
-        "bucket_mass_kg": ("bucket load [kg]", "{:.0f}"),
         "weighed_mass_kg": ("weighed [kg]", "{:.0f}"),
-        "loading_time_s": ("loading time [s]", "{:.2f}"),
         "energy_J": ("motors' work [J]", "{:.3g}"),
-        "payload_percent": ("payload [%]", "{:.1f}"),
-        "fill_factor": ("fill factor", "{:.2f}"),
         "bucket_phase_kWh_per_t": ("energy of the bucket phase [kWh/t]", "{:.3f}"),
         "loading_kWh_per_t": ("energy of the loading [kWh/t]", "{:.3f}"),
         "tractive_effort_mean_N": ("tractive effort, mean [N]", "{:.3g}"),
