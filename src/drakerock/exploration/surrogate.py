@@ -35,9 +35,8 @@ class Surrogate(MultiOutputMixin, RegressorMixin, BaseEstimator):
         config: how to fit.
         seed: seed of the study; the fit is a function of it and of the data only.
 
-    Attributes after `fit`:
-        models_: the fitted `Kriging` models in the objectives' order.
-        X_, Y_, noise_: (n, d), (n, k), (n, k) what they are fitted to; NaN where there is none.
+    After `fit` there are ``models_``, the fitted `Kriging` models in the objectives' order, and what they are fitted
+    to: ``X_`` (n, d), ``Y_`` (n, k) and ``noise_`` (n, k); NaN where there is none.
     """
 
     def __init__(

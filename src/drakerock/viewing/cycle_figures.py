@@ -299,7 +299,8 @@ def make_preview_figure(
         plan: what would be tried; None: there is none.
         width: of the bucket [m].
     """
-    figure = Figure(figsize=(9, 9), layout="constrained")
+    # Not "constrained": it cuts off labels of axes whose aspect is fixed.
+    figure = Figure(figsize=(9, 9), layout="compressed")
     side, top = figure.subplots(2, 1)
     draw_height_field(top, field, profile, plan)
     side.set(xlabel="x [m]", ylabel="z [m]", aspect="equal")
@@ -313,7 +314,7 @@ def make_preview_figure(
     note = "" if plan.reached else ", the nearest that can be reached"
     title = f"Plan at y = {plan.y:.2f} m: {plan.volume:.2f} of {plan.volume_wanted:.2f} m³{note}"
     side.set_title(title, loc="left", fontsize=11)
-    side.legend(loc="upper left", fontsize=8)
+    side.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=8, frameon=False)
     return figure
 
 
