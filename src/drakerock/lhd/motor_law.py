@@ -24,9 +24,11 @@ All meet without a jump of torque. u takes back what b does to a motor within it
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 # A command below this is none: the valve is closed [rad/s].
 DEADBAND = 1e-4
@@ -73,6 +75,11 @@ class Motor:
     inertia: float = 0.0
     time_step: float = 0.01
 
+    @cached_property
+    def _columns(self) -> NDArray[np.float64]:
+        """(2, k) the curve's rates and torques."""
+        return np.array(self.curve).T
+
     @property
     def peak(self) -> float:
         """The largest torque of all [N m]."""
@@ -91,14 +98,14 @@ class Motor:
         """Return the largest torque [N m] of a moving motor at a rate [rad/s] in the torque's direction."""
         if not self.curve:
             return self.effort
-        rates, torques = np.array(self.curve).T
+        rates, torques = self._columns
         return float(np.interp(rate, rates, torques))
 
     def find_step_limit(self, side: float, rate: float, before: MotorState) -> float:
         """Return the largest torque [N m] on a side, 1 or -1, over a step that begins at a rate [rad/s]."""
         if not self.curve or side * rate < 0.0:
             return self.effort
-        rates, torques = np.array(self.curve).T
+        rates, torques = self._columns
         slope = self.inertia / self.time_step
         load = before.torque - slope * (rate - before.rate)
         # At the end's rate r the curve gives load + slope (r - rate): one rate, since the one falls, the other rises.
@@ -109,7 +116,7 @@ class Motor:
         """Return the largest rate [rad/s] at which a moving motor can give a torque [N m]; 0: at none."""
         if not self.curve:
             return float("inf") if torque <= self.effort else 0.0
-        rates, torques = np.array(self.curve).T
+        rates, torques = self._columns
         return float(np.interp(-torque, -torques, rates, left=0.0))
 
     def is_closed(self, wanted: float, rate: float, before: MotorState) -> bool:
@@ -131,7 +138,7 @@ class Motor:
 
     def calc_command(self, wanted: float, rate: float, before: MotorState) -> MotorCommand:
         """Return what the motor is told for the coming step; arguments as of `is_closed`."""
-        wanted = float(np.clip(wanted, -self.velocity, self.velocity))
+        wanted = min(max(wanted, -self.velocity), self.velocity)
         if self.is_closed(wanted, rate, before):
             target, carried, side, limit = 0.0, before.torque, np.sign(before.torque), self.relief
         else:

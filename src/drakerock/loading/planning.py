@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import shapely
@@ -16,7 +17,6 @@ from drakerock.errors import InputError
 from drakerock.lhd.geometry import BucketGeometry, calc_heaped_capacity
 from drakerock.lhd.kinematics import (
     Kinematics,
-    calc_bucket_range,
     calc_full_tilt,
     calc_joint_angles,
     calc_pitch,
@@ -191,6 +191,7 @@ def make_dig_plan(
     # The tip enters at the clearance above the floor, so that much less is left to lift.
     lift_height = max(h_s2 - config.floor_clearance, 0.0)
 
+    @cache
     def plan_dig(height: float) -> tuple[_Path, float, _Tables]:
         return _plan_dig(strategy.kappa, height, slope, kin, config, speed_floor)
 
@@ -343,8 +344,7 @@ def _integrate_lift(
         omega = min(tables.omega.calc(psi), (psi_end - psi) / step) if psi < psi_end else 0.0
         wheel, boom, bucket = calc_motor_rates(kin, phi_l, phi_b, v_x, v_z, omega)
         phi_l = max(phi_l + boom * step, float(kin.phi_l_range[0]))
-        stop, _ = calc_bucket_range(kin, phi_l)
-        phi_b = max(phi_b + bucket * step, float(stop))
+        phi_b = max(phi_b + bucket * step, float(np.interp(phi_l, kin.phi_l_grid, kin.phi_b_min)))
         t += step
         psi = float(calc_pitch(kin, phi_l, phi_b))
         x_last = x_tip

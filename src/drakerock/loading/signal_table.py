@@ -21,7 +21,10 @@ def save_signals(columns: dict[str, Array], units: dict[str, str], path: str | P
         InputError: the file cannot be written.
     """
     schema = pa.schema([pa.field(name, pa.float64(), metadata={"unit": units[name]}) for name in columns])
-    table = pa.table([pa.array(column) for column in columns.values()], schema=schema)
+    # Not by `pa.array(column)`, which imports pandas only to see that a column is none of its own.
+    buffers = [pa.py_buffer(np.ascontiguousarray(column, float)) for column in columns.values()]
+    arrays = [pa.Array.from_buffers(pa.float64(), len(buffer) // 8, [None, buffer]) for buffer in buffers]
+    table = pa.table(arrays, schema=schema)
     try:
         pq.write_table(table, path)
     except OSError as error:

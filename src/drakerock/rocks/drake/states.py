@@ -71,7 +71,7 @@ class RockStates:
         other, self._states = [state for state in self._states if state is not now], (now,)
         room = other[0].room if other else None
         if room is not None and now.report is not None and other[0].arrays.steps == number - 1:
-            self._engine.write_changes(now.arrays, now.report, room)
+            self._engine.refresh_room(now.arrays, now.report, room)
         else:
             room = self._engine.make_room() if room is None else room
             self._engine.copy_to(now.arrays, room)

@@ -278,13 +278,13 @@ class NonsmoothRocks(RockSystem):
         report = self._solve(context).report
         assert report is not None
         forces = []
-        for index, F_B_W in zip(self._bodies, report.F_Bs_W, strict=True):
-            if F_B_W.any():
-                force = ExternallyAppliedSpatialForce()
-                force.body_index = index
-                force.p_BoBq_B = np.zeros(3)
-                force.F_Bq_W = SpatialForce(F_B_W[:3], F_B_W[3:])
-                forces.append(force)
+        for k in np.flatnonzero(report.F_Bs_W.any(axis=1)):
+            F_B_W = report.F_Bs_W[k]
+            force = ExternallyAppliedSpatialForce()
+            force.body_index = self._bodies[k]
+            force.p_BoBq_B = np.zeros(3)
+            force.F_Bq_W = SpatialForce(F_B_W[:3], F_B_W[3:])
+            forces.append(force)
         output.set_value(forces + self._read_others(context))
 
 

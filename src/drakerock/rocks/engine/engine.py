@@ -29,6 +29,7 @@ from drakerock.rocks.engine.compiling import announce_compilation
 from drakerock.rocks.engine.config import NonsmoothConfig
 from drakerock.rocks.engine.contact_cache import CacheIndex
 from drakerock.rocks.engine.contact_law import ContactLaw
+from drakerock.rocks.engine.memory_access import make_aligned_zeros
 from drakerock.rocks.engine.records import (
     BODY,
     FOLLOWED,
@@ -226,7 +227,7 @@ class NonsmoothEngine(RockSet):
             SiteBox(self.lower_site, self.upper_site),
             self.time_step,
         )
-        self._bodies = np.zeros(n + 1, BODY)
+        self._bodies = make_aligned_zeros((n + 1,), BODY)
         self._single_bodies = make_single_bodies(n + 1)
         # Zero between steps, for the rocks.
         self._velocities = np.zeros((n + 1 + self.n_machine_bodies, 6))
@@ -262,7 +263,7 @@ class NonsmoothEngine(RockSet):
             arrays: state at t_n; not changed.
             machine: the machine at t_n, see `MachineStep`.
             room: where the result is written, see `make_room`; new if None. What the step does not change is left as
-                it is in it, see `write_changes`: to copy it would take longer than all else where little is awake.
+                it is in it, see `refresh_room`: to copy it would take longer than all else where little is awake.
 
         Returns:
             state at t_n + dt, with its index if it is in a room, and the report.

@@ -160,18 +160,21 @@ class RockSet:
             contact_cache.make_contact_cache(self.capacity),
         )
 
-    def write_changes(self, new: RockArrays, report: StepReport, target: RockArrays) -> None:
-        """Write what a step has changed into a copy of the state before it.
+    def refresh_room(self, new: RockArrays, report: StepReport, target: RockArrays) -> None:
+        """Make a copy of the state before a step room for the step after it: write what that one leaves as it is.
+
+        Rocks that are awake, and their contacts, the next step writes itself.
 
         Args:
             new, report: what `step` gave.
             target: its arrays are changed, `n_sleeping`, `steps` and `index` are not; the cache has its full capacity.
         """
+        stopped = report.awake[new.sleep["status"][report.awake] != AWAKE]
         for name in MOTION:
-            getattr(target, name)[report.awake] = getattr(new, name)[report.awake]
+            getattr(target, name)[stopped] = getattr(new, name)[stopped]
         copy_records(new.sleep, target.sleep, report.stirred)
         target.cache.pairs[report.freed] = -1
-        changed = slice(report.n_kept, len(new.cache.pairs))
+        changed = slice(report.n_kept, new.n_sleeping)
         for before, after in zip(target.cache, new.cache, strict=True):
             before[changed] = after[changed]
 

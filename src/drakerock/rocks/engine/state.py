@@ -112,7 +112,7 @@ class RockArrays:
         n_sleeping: so many of them, the first, are of rocks that slept in the last step; gaps among them.
         steps: how many have been taken.
         index: None: not known, and found anew. Who changes arrays that have one, other than by
-            `NonsmoothEngine.write_changes`, takes it away.
+            `NonsmoothEngine.refresh_room`, takes it away.
     """
 
     quaternions: Array
