@@ -299,7 +299,7 @@ def make_preview_figure(
         plan: what would be tried; None: there is none.
         width: of the bucket [m].
     """
-    # Not "constrained": it cuts off labels of axes whose aspect is fixed.
+    # matplotlib's layout for axes of a fixed aspect.
     figure = Figure(figsize=(9, 9), layout="compressed")
     side, top = figure.subplots(2, 1)
     draw_height_field(top, field, profile, plan)
