@@ -425,24 +425,20 @@ def test_a_refreshed_room_is_as_good_as_a_copy_of_the_whole_state():
     assert n_stopped > 5
 
 
-def copy_state(engine, arrays):
-    """Return a copy of a state in arrays of full capacity, as the rocks' system keeps it; and the state in it."""
-    copy = engine.make_room()
-    engine.copy_to(arrays, copy)
-    return copy, replace(
-        copy,
-        cache=copy.cache.select(slice(len(arrays.cache.pairs))),
-        n_sleeping=arrays.n_sleeping,
-        steps=arrays.steps,
-    )
+def make_rooms(engine, arrays):
+    """Return two rooms for the steps after a state, by turns, as the rocks' system keeps them."""
+    rooms = [engine.make_room(), engine.make_room()]
+    for room in rooms:
+        engine.copy_to(arrays, room)
+    return rooms
 
 
-def step_in_place(engine, copy, state, machine, room):
-    """Step a state that lies in `copy`, its index known; return it and the report."""
-    new, report = engine.step(state, machine, room)
-    engine.copy_to(new, copy)
-    cache = copy.cache.select(slice(len(new.cache.pairs)))
-    return replace(copy, cache=cache, n_sleeping=new.n_sleeping, steps=new.steps, index=new.index), report
+def step_in_rooms(engine, rooms, state, machine):
+    """Step into the room that is ready, its index known, and make the other one ready; return state and report."""
+    new, report = engine.step(state, machine, rooms[0])
+    engine.refresh_room(new, report, rooms[1])
+    rooms.reverse()
+    return new, report
 
 
 def assert_same_state(one, other):
@@ -457,7 +453,7 @@ def assert_same_state(one, other):
 def test_what_is_known_of_a_state_changes_nothing():
     """A sleeping heap that rocks fall on, one of which leaves the site, and a sensor that comes near.
 
-    Two states by turns in one engine, each stepped with its index in place, and by another engine that looks at all
+    Two states by turns in one engine, each stepped in its rooms with its index, and by another engine that looks at all
     rocks in every step.
     """
     engine, arrays = settle_at_rest()
@@ -468,17 +464,17 @@ def test_what_is_known_of_a_state_changes_nothing():
     V_WRs[:, 3:] = [0.0, 0.0, -4.0]
     V_WRs[-1, 3:] = [0.0, 0.0, 4000.0]  # the topmost, which meets none on its way
     thrown = engine.place(arrays, top, pile.p_WRs[top] + [0.0, 0.0, 1.0], V_WRs)
-    machine, room = make_machineless_step(), engine.make_room()
-    states = [copy_state(engine, thrown), copy_state(engine, arrays)]
+    machine = make_machineless_step()
+    states = [(make_rooms(engine, state), state) for state in (thrown, arrays)]
     expected = [thrown, arrays]
     seen = np.zeros(4)
     for k in range(60):
         box = np.concatenate([np.eye(3).reshape(-1), [2.5 - 0.05 * k, 0.0, 0.0], [-0.3] * 3, [0.3] * 3])
         machine = replace(machine, sensors=box[None]) if k >= 20 else machine
         for number in range(2) if k % 3 < 2 else (0,):
-            copy, state = states[number]
-            state, report = step_in_place(engine, copy, state, machine, room)
-            states[number] = copy, state
+            rooms, state = states[number]
+            state, report = step_in_rooms(engine, rooms, state, machine)
+            states[number] = rooms, state
             expected[number], whole = other.step(expected[number], machine)
             assert_same_state(state, expected[number])
             for name in ("n_woken", "n_asleep", "n_lost", "n_contacts", "residual"):
