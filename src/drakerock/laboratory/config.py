@@ -97,13 +97,13 @@ class PenetrationSettings(LabSettings):
 class DragSettings(LabSettings):
     """A vertical blade as wide as the bed, drawn through it."""
 
-    rocks: Annotated[int, Field(ge=20, le=20_000, description="in each specimen")] = 350
+    rocks: Annotated[int, Field(ge=20, le=20_000, description="in each specimen")] = 900
     depths: Annotated[Lengths, Field(min_length=1, description="of the blade's edge [mean size]")] = (
-        1.5,
         2.5,
+        4.0,
     )
     speed: Annotated[float, Field(gt=0, le=2, description="[m/s]")] = 0.3
-    travel: Annotated[float, Field(ge=1, le=20, description="[depth]")] = 2.0
+    travel: Annotated[float, Field(ge=1, le=20, description="[depth]")] = 1.5
     blade_friction: Annotated[float, Field(ge=0, le=1, description="between blade and rock")] = 0.4
     friction_angle_deg: Annotated[
         float | None,

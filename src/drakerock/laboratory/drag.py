@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,6 @@ from drakerock.laboratory.beds import (
     THICKNESS,
     Bin,
     MakeRig,
-    calc_packing,
     calc_profile,
     fill_bin,
     settle,
@@ -26,19 +26,68 @@ from drakerock.laboratory.material import Material
 from drakerock.laboratory.results import Curve, Known, Panel, Row, Snapshot, Specimen, take_snapshot
 from drakerock.laboratory.scene import Mover, Scene, Slab
 from drakerock.laboratory.shear import ShearTest
-from drakerock.laboratory.theory import FEE_RESIDUAL, calc_blade_force
+from drakerock.laboratory.theory import FEE_RESIDUAL, calc_blade_force, calc_curved_blade_force
 from drakerock.rocks.config import GRAVITY
 
 Array = NDArray[np.float64]
 
 # Of the blade, and its edge's gap over the floor [mean size]: rocks that fit under it would jam.
 BLADE, UNDER = 0.2, 0.06
-# Before the blade's last place there is so much of the bed, for the wedge [depth].
-AHEAD = 3.0
+# Before the blade's last place there is so much of the bed [depth]: a wedge against a rough blade is three to four
+# long, and one that reaches the bed's end is jammed.
+AHEAD = 6.0
 # The force is taken after this share of the travel; forces are means over so many slices of it.
 STARTED, SLICES = 0.25, 6
+# Of the surface that the curved slip comes out of [m].
+CELL = 0.02
 # The shear test that is made for the prediction's friction angle: stresses [kPa], about those in the wedge and above.
 SHEAR = ShearSettings(repeats=1, stresses_kPa=(25.0, 50.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Drag:
+    """A drag: forces on the blade, and what they are predicted from, over slices of its travel (k,).
+
+    Attributes:
+        force, lift: on the blade against its way, and upwards [N].
+        places: of the slices' middles [m].
+        heaps: volume heaped up before the blade [m^3].
+        surfaces: heights over the blade's edge from the blade on, at steps of CELL [m].
+        cut, width: of the blade in the bed [m].
+        weight: of the bed [N/m^3].
+        x, curve: travel [m] and force [N], step by step.
+        snapshot: how it looked.
+    """
+
+    force: Array
+    lift: Array
+    places: Array
+    heaps: Array
+    surfaces: tuple[Array, ...]
+    cut: float
+    width: float
+    weight: float
+    x: Array
+    curve: Array
+    snapshot: Snapshot
+
+    def predict(self, angle: float, wall: float) -> Array:
+        """Return the force by the earth-moving equation (k,) [N] from both friction angles [rad]."""
+        return np.array(
+            [
+                calc_blade_force(self.cut, self.width, self.weight, self.weight * heap, angle, wall)
+                for heap in self.heaps
+            ]
+        )
+
+    def predict_curved(self, angle: float, wall: float) -> Array:
+        """Return the force by a curved slip surface (k,) [N] from both friction angles [rad]."""
+        return self.width * np.array(
+            [
+                calc_curved_blade_force(np.arange(len(h), dtype=float) * CELL, h, self.weight, angle, wall)
+                for h in self.surfaces
+            ]
+        )
 
 
 class DragTest:
@@ -56,91 +105,38 @@ class DragTest:
             shear = ShearTest().measure(
                 material, SHEAR.replace(rocks=min(settings.rocks, 250)), seed, make_rig
             )
-            angle = shear.values[f"peak_{min(SHEAR.stresses_kPa):g}"]
+            # A wedge is sheared far beyond its peak.
+            angle = shear.values[f"end_{min(SHEAR.stresses_kPa):g}"]
         values: dict[str, float] = {"angle": angle}
         curves: dict[str, tuple[Array, Array]] = {}
-        errors = []
+        errors: dict[str, list[Array]] = {"residual": [], "mobilised_residual": [], "curved_residual": []}
+        last: Snapshot | None = None
         for ratio in settings.depths:
-            found, last = self._drag(material, settings, ratio * material.mean_size, angle, seed, make_rig)
-            label = f"{ratio:g}"
-            measured, predicted, x, force, heaped = found
-            values |= {
-                f"force_{label}": float(measured.mean()) / 1e3,
-                f"predicted_{label}": float(predicted.mean()) / 1e3,
-                f"heap_{label}": float(heaped.mean()),
+            drag = _drag(material, settings, ratio * material.mean_size, seed, make_rig)
+            label, last = f"{ratio:g}", drag.snapshot
+            friction, given = np.deg2rad(angle), float(np.arctan(settings.blade_friction))
+            found = max(float(np.arctan2(drag.lift.mean(), drag.force.mean())), 0.0)
+            predictions = {
+                "residual": drag.predict(friction, given),
+                "mobilised_residual": drag.predict(friction, found),
+                "curved_residual": drag.predict_curved(friction, found),
             }
-            errors.append((measured - predicted) / measured.mean())
-            curves[f"force_{label}"] = (x, force / 1e3)
-            middle = x[-1] * (STARTED + (1 - STARTED) * (np.arange(SLICES) + 0.5) / SLICES)
-            curves[f"predicted_{label}"] = (middle, predicted / 1e3)
-        values["residual"] = 100 * float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
-        values["bias"] = 100 * float(np.mean(np.concatenate(errors)))
+            values |= {
+                f"force_{label}": float(drag.force.mean()) / 1e3,
+                f"predicted_{label}": float(predictions["residual"].mean()) / 1e3,
+                f"mobilised_{label}": float(predictions["mobilised_residual"].mean()) / 1e3,
+                f"curved_{label}": float(predictions["curved_residual"].mean()) / 1e3,
+                f"wall_{label}": float(np.tan(found)),
+                f"heap_{label}": float(drag.heaps.mean()),
+            }
+            for key, predicted in predictions.items():
+                errors[key].append((drag.force - predicted) / drag.force.mean())
+            curves[f"force_{label}"] = (drag.x, drag.curve / 1e3)
+            curves[f"predicted_{label}"] = (drag.places, predictions["mobilised_residual"] / 1e3)
+        for key, parts in errors.items():
+            values[key] = 100 * float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+        values["bias"] = 100 * float(np.mean(np.concatenate(errors["mobilised_residual"])))
         return Specimen(values, curves, last)
-
-    def _drag(
-        self,
-        material: Material,
-        settings: DragSettings,
-        depth: float,
-        angle: float,
-        seed: int,
-        make_rig: MakeRig,
-    ) -> tuple[tuple[Array, Array, Array, Array, Array], Snapshot]:
-        d = material.mean_size
-        travel = settings.travel * depth
-        room = _make_bed(material, settings.rocks, travel + AHEAD * depth, depth + UNDER * d)
-        level, tall = room.height, 40.0
-        thick, edge = BLADE * d, level - depth
-        # The bed ends at the blade.
-        step = Slab((THICKNESS, room.width, THICKNESS), (-0.5 * THICKNESS, 0.0, edge - 0.5 * THICKNESS))
-        walls = (*room.make_walls("flre", 0.0), step)
-        blade = Slab(
-            (thick, room.width, tall),
-            (-0.5 * thick, 0.0, edge + 0.5 * tall),
-            friction=settings.blade_friction,
-        )
-        mover = Mover("blade", (blade,), (1.0, 0.0, 0.0))
-        rig = make_rig(Scene(walls, (mover,)), fill_bin(material, settings.rocks, room, seed), material)
-        settle(rig, material)
-        bed = rig.get_pile()
-        ahead = np.arange(0.0, room.length, 0.25 * d)
-        before = calc_profile(bed, material, ahead, 0.45 * room.width)
-        # The level that rocks really have before the blade, and so the depth.
-        surface = float(before[(ahead > 0.5 * d) & (ahead < travel + depth)].mean())
-        cut = surface - edge
-        density = material.config.density * calc_packing(
-            bed, material,
-            np.array([0.0, -0.5 * room.width, 0.3 * d]),
-            np.array([room.length, 0.5 * room.width, max(surface - 0.7 * d, d)]),
-        )  # fmt: skip
-        records, heaps = [], []
-        for _ in range(2 * SLICES):
-            records.append(rig.advance(travel / settings.speed / (2 * SLICES), {"blade": settings.speed}))
-            at = float(records[-1].travels["blade"][-1])
-            now = calc_profile(rig.get_pile(), material, ahead, 0.45 * room.width)
-            front = ahead > at
-            raised = float(
-                np.maximum(now - surface, 0.0)[front].sum() - np.maximum(before - surface, 0.0)[front].sum()
-            )
-            heaps.append(max(raised, 0.0) * 0.25 * d * room.width)
-        x = np.concatenate([record.travels["blade"] for record in records])
-        force = -np.concatenate([record.forces["blade"][:, 0] for record in records])
-        edges = travel * (STARTED + (1 - STARTED) * np.linspace(0, 1, SLICES + 1))
-        measured = np.array([force[(x > a) & (x <= b)].mean() for a, b in itertools.pairwise(edges)])
-        places = travel * (np.arange(2 * SLICES) + 1) / (2 * SLICES)
-        heaped = np.interp(0.5 * (edges[1:] + edges[:-1]), places, heaps)
-        weight = density * GRAVITY
-        wall = float(np.arctan(settings.blade_friction))
-        predicted = np.array(
-            [
-                calc_blade_force(cut, room.width, weight, weight * heap, np.deg2rad(angle), wall)
-                for heap in heaped
-            ]
-        )
-        moved = take_snapshot(rig.get_pile(), (blade,), (float(x[-1]), 0.0, 0.0))
-        still = take_snapshot(rig.get_pile(), walls)
-        snapshot = Snapshot(moved.pile, still.slabs + moved.slabs)
-        return (measured, predicted, x, force, heaped), snapshot
 
     def evaluate(
         self, specimens: Sequence[Specimen], material: Material, settings: LabSettings
@@ -153,7 +149,16 @@ class DragTest:
         for ratio in settings.depths:
             label = f"{ratio:g}"
             rows.append(make_row(specimens, f"force_{label}", f"force, {label} mean sizes deep", "kN", None))
-            rows.append(make_row(specimens, f"predicted_{label}", "... predicted", "kN"))
+            rows.append(
+                make_row(specimens, f"predicted_{label}", "... predicted from the blade's friction", "kN")
+            )
+            rows.append(
+                make_row(
+                    specimens, f"wall_{label}", "... blade's friction that is mobilised (lift over force)", ""
+                )
+            )
+            rows.append(make_row(specimens, f"mobilised_{label}", "... predicted from that", "kN"))
+            rows.append(make_row(specimens, f"curved_{label}", "... and with a curved slip surface", "kN"))
             rows.append(make_row(specimens, f"heap_{label}", "... heap before the blade", "m3"))
             for number, specimen in enumerate(specimens):
                 shown = f"{label} deep" if number == 0 else ""
@@ -162,9 +167,76 @@ class DragTest:
                 np.mean([one.curves[f"predicted_{label}"][k] for one in specimens], axis=0) for k in (0, 1)
             )
             curves.append(Curve(x, y, f"{label} deep, predicted", "dashed"))
-        rows.append(make_row(specimens, "residual", "prediction's residual, rms", "%", Known(*FEE_RESIDUAL)))
+        known = Known(*FEE_RESIDUAL)
+        rows.append(make_row(specimens, "residual", "residual, rms, from the blade's friction", "%", known))
+        rows.append(make_row(specimens, "mobilised_residual", "... from the mobilised friction", "%", known))
         rows.append(make_row(specimens, "bias", "... measured less predicted, mean", "%"))
+        rows.append(make_row(specimens, "curved_residual", "... with a curved slip surface", "%", known))
         return tuple(rows), (Panel("travel [m]", "force [kN]", tuple(curves)),)
+
+
+def _drag(material: Material, settings: DragSettings, depth: float, seed: int, make_rig: MakeRig) -> _Drag:
+    """Drag a blade through a bed at a depth [m]."""
+    d = material.mean_size
+    travel = settings.travel * depth
+    room = _make_bed(material, settings.rocks, travel + AHEAD * depth, depth + UNDER * d)
+    level, tall = room.height, 40.0
+    thick, edge = BLADE * d, level - depth
+    # The bed ends at the blade.
+    step = Slab((THICKNESS, room.width, THICKNESS), (-0.5 * THICKNESS, 0.0, edge - 0.5 * THICKNESS))
+    walls = (*room.make_walls("flre", 0.0), step)
+    blade = Slab(
+        (thick, room.width, tall),
+        (-0.5 * thick, 0.0, edge + 0.5 * tall),
+        friction=settings.blade_friction,
+    )
+    mover = Mover("blade", (blade,), (1.0, 0.0, 0.0))
+    rig = make_rig(Scene(walls, (mover,)), fill_bin(material, settings.rocks, room, seed), material)
+    settle(rig, material)
+    bed = rig.get_pile()
+    ahead = np.arange(0.0, room.length, 0.25 * d)
+    before = calc_profile(bed, material, ahead, 0.45 * room.width)
+    # The level that rocks really have before the blade, and so the depth.
+    surface = float(before[(ahead > 0.5 * d) & (ahead < travel + depth)].mean())
+    cut = surface - edge
+    # By the surface that is seen, as all weights are.
+    bed_mass = float(material.calc_masses(bed).sum())
+    weight = GRAVITY * bed_mass / (room.length * room.width * float(before.mean()))
+    records, heaps, profiles = [], [], []
+    for _ in range(2 * SLICES):
+        records.append(rig.advance(travel / settings.speed / (2 * SLICES), {"blade": settings.speed}))
+        at = float(records[-1].travels["blade"][-1])
+        now = calc_profile(rig.get_pile(), material, ahead, 0.45 * room.width)
+        profiles.append(now)
+        front = ahead > at
+        raised = float(
+            np.maximum(now - surface, 0.0)[front].sum() - np.maximum(before - surface, 0.0)[front].sum()
+        )
+        heaps.append(max(raised, 0.0) * 0.25 * d * room.width)
+    x = np.concatenate([record.travels["blade"] for record in records])
+    forces = np.concatenate([record.forces["blade"] for record in records])
+    edges = travel * (STARTED + (1 - STARTED) * np.linspace(0, 1, SLICES + 1))
+    means = np.array([forces[(x > a) & (x <= b)].mean(axis=0) for a, b in itertools.pairwise(edges)])
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    places = travel * (np.arange(2 * SLICES) + 1) / (2 * SLICES)
+    surfaces = []
+    for middle in middles:
+        profile = np.array([np.interp(middle, places, column) for column in np.array(profiles).T])
+        surfaces.append(_find_surface(ahead - middle, profile - edge, d))
+    moved = take_snapshot(rig.get_pile(), (blade,), (float(x[-1]), 0.0, 0.0))
+    still = take_snapshot(rig.get_pile(), walls)
+    return _Drag(
+        -means[:, 0], means[:, 2], middles, np.interp(middles, places, heaps), tuple(surfaces), cut, room.width,
+        weight, x, -forces[:, 0], Snapshot(moved.pile, still.slabs + moved.slabs),
+    )  # fmt: skip
+
+
+def _find_surface(x: Array, h: Array, size: float) -> Array:
+    """Return heights from the blade on at steps of CELL; at the blade, where rocks lean on it, the mean over a size."""
+    fine = np.arange(0.0, float(x[-1]), CELL)
+    surface = np.maximum(np.interp(fine, x, h), CELL)
+    surface[0] = surface[fine < size].mean()
+    return surface
 
 
 def _make_bed(material: Material, rocks: int, length: float, height: float) -> Bin:

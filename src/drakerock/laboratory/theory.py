@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
+from scipy.optimize import brute, minimize_scalar
 
 from drakerock.rocks.config import GRAVITY
 
@@ -127,3 +127,50 @@ def calc_blade_force(
     highest = 0.5 * np.pi - friction - 1e-3
     found = minimize_scalar(calc_force, bounds=(0.05, highest), method="bounded")
     return float(found.fun * np.sin(rake + wall))
+
+
+def calc_curved_blade_force(x: Array, h: Array, weight: float, friction: float, wall: float) -> float:
+    """Return the horizontal force on a vertical blade by a curved slip surface, over the blade's width [N/m].
+
+    Terzaghi (1943): the slip surface is a logarithmic spiral from the blade's edge, so that what acts on it passes
+    through its pole, and moments about the pole give the force: that of the weakest spiral. The force is at the wall's
+    friction angle to the blade's normal and a third of the rock's height at the blade above the edge. Inf: no spiral
+    from the edge comes out of the surface.
+
+    Against a rough blade the earth-moving equation's plane is stronger than this, the more so the greater both angles.
+
+    Args:
+        x: (k,) evenly spaced from the blade on, from 0 [m].
+        h: (k,) the surface's height over the blade's edge, with all that is heaped up [m].
+        weight: of the bed [N/m^3].
+        friction: the material's friction angle [rad].
+        wall: the blade's friction angle [rad].
+    """
+    turns = np.linspace(0.0, 2.5, 300)
+    growth = np.exp(turns * np.tan(friction))
+    step, high = float(x[1] - x[0]), float(h[0])
+
+    def calc_force(pole: Array) -> float:
+        # By the pole's direction from the edge and the logarithm of its distance over the height at the blade.
+        radius = high * np.exp(pole[1])
+        pole_x, pole_z = radius * np.cos(pole[0]), radius * np.sin(pole[0])
+        angles = pole[0] + np.pi + turns
+        path_x = pole_x + radius * growth * np.cos(angles)
+        path_z = pole_z + radius * growth * np.sin(angles)
+        # Up to where it would turn back.
+        ends = int(np.argmax(np.diff(path_x) <= 0.0)) if (np.diff(path_x) <= 0.0).any() else len(turns) - 1
+        if ends < 1:
+            return 1e30
+        slip = np.interp(x, path_x[: ends + 1], path_z[: ends + 1], right=np.nan)
+        out = np.flatnonzero(slip[1:] >= h[1:])
+        if not len(out) or np.isnan(slip[: out[0] + 1]).any():
+            return 1e30
+        k = int(out[0]) + 1
+        moment = weight * step * float(np.sum(np.maximum(h[:k] - slip[:k], 0.0) * (x[:k] - pole_x)))
+        arm = pole_x * np.sin(wall) + (pole_z - high / 3.0) * np.cos(wall)
+        return moment / arm if moment > 0.0 and arm > 1e-9 else 1e30
+
+    directions = slice(0.35, 3.0, 0.09)
+    distances = slice(np.log(0.7), np.log(60.0), 0.2)
+    force = float(brute(calc_force, (directions, distances), full_output=True)[1])
+    return force * float(np.cos(wall)) if force < 1e29 else float("inf")

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drakerock.laboratory.theory import (
     calc_beverloo_rate,
     calc_blade_force,
+    calc_curved_blade_force,
     calc_dilation,
     calc_hopper_factor,
     calc_janssen_share,
@@ -48,6 +49,33 @@ def test_the_blades_wedge_is_in_balance_at_the_weakest_plane(friction, wall, sur
     reaction, push = np.linalg.solve(sums.transpose(2, 0, 1), loads[:, :, None])[:, :, 0].T
     least = (push[(reaction > 0) & (push > 0)] * np.cos(wall)).min()
     assert calc_blade_force(1.0, 1.0, 15e3, surcharge, friction, wall) == pytest.approx(least, rel=1e-3)
+
+
+@settings(max_examples=20, deadline=None)
+@given(ANGLES, st.floats(0.0, 0.9))
+def test_a_curved_slip_lies_between_the_lower_bound_and_the_plane(friction, share):
+    # Lancellotta (2002): the exact lower bound of the passive pressure on a rough vertical wall.
+    wall = share * friction
+    ratio = np.sin(wall) / np.sin(friction)
+    root = np.sqrt(np.sin(friction) ** 2 - np.sin(wall) ** 2)
+    bound = np.cos(wall) / (1 - np.sin(friction)) * (np.cos(wall) + root)
+    bound *= np.exp((np.arcsin(ratio) + wall) * np.tan(friction))
+    x = np.arange(0.0, 30.0, 0.02)
+    force = calc_curved_blade_force(x, np.ones_like(x), 2.0, friction, wall)
+    plane = calc_blade_force(1.0, 1.0, 2.0, 0.0, friction, wall)
+    assert 0.99 * bound < force < 1.01 * plane
+
+
+def test_a_heap_counts_where_it_lies_and_a_bed_that_is_too_short_jams():
+    x = np.arange(0.0, 30.0, 0.02)
+    level = np.ones_like(x)
+    bare, near, far = (
+        calc_curved_blade_force(x, level + 0.5 * ((x > a) & (x < a + 1.0)), 2.0, 0.65, 0.3)
+        for a in (99.0, 0.5, 20.0)
+    )
+    assert near > 1.1 * bare
+    assert far == pytest.approx(bare)
+    assert calc_curved_blade_force(x[:40], level[:40], 2.0, 0.65, 0.3) == np.inf
 
 
 @given(st.floats(0.1, 2.0), st.floats(0.5, 8.0))
