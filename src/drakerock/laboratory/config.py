@@ -78,12 +78,16 @@ class SettlementSettings(LabSettings):
 class PenetrationSettings(LabSettings):
     """A tool pushed level into a slope at imposed speeds."""
 
+    rocks: Annotated[int, Field(ge=20, le=20_000, description="in each specimen")] = 1000
     repeats: Annotated[int, Field(ge=1, le=100, description="specimens, each of rocks of its own")] = 4
-
     speeds: Annotated[
         tuple[Annotated[float, Field(gt=0, le=3)], ...], Field(min_length=1, description="[m/s]")
     ] = (0.3, 0.6, 1.2)
-    depths: Annotated[Lengths, Field(min_length=2, description="of the tip [mean size]")] = (1.0, 2.0, 3.0)
+    depths: Annotated[Lengths, Field(min_length=2, description="of the tip [mean size]")] = (
+        2.0,
+        4.0,
+        6.0,
+    )
     height: Annotated[
         float,
         Field(

@@ -132,10 +132,10 @@ class DragTest:
             for key, predicted in predictions.items():
                 errors[key].append((drag.force - predicted) / drag.force.mean())
             curves[f"force_{label}"] = (drag.x, drag.curve / 1e3)
-            curves[f"predicted_{label}"] = (drag.places, predictions["mobilised_residual"] / 1e3)
+            curves[f"predicted_{label}"] = (drag.places, predictions["residual"] / 1e3)
         for key, parts in errors.items():
             values[key] = 100 * float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
-        values["bias"] = 100 * float(np.mean(np.concatenate(errors["mobilised_residual"])))
+            values[key.replace("residual", "bias")] = 100 * float(np.mean(np.concatenate(parts)))
         return Specimen(values, curves, last)
 
     def evaluate(
@@ -168,10 +168,13 @@ class DragTest:
             )
             curves.append(Curve(x, y, f"{label} deep, predicted", "dashed"))
         known = Known(*FEE_RESIDUAL)
-        rows.append(make_row(specimens, "residual", "residual, rms, from the blade's friction", "%", known))
-        rows.append(make_row(specimens, "mobilised_residual", "... from the mobilised friction", "%", known))
-        rows.append(make_row(specimens, "bias", "... measured less predicted, mean", "%"))
-        rows.append(make_row(specimens, "curved_residual", "... with a curved slip surface", "%", known))
+        for key, name in (
+            ("", "from the blade's friction"),
+            ("mobilised_", "from the mobilised friction"),
+            ("curved_", "from that and a curved slip surface"),
+        ):
+            rows.append(make_row(specimens, f"{key}residual", f"residual, rms, {name}", "%", known))
+            rows.append(make_row(specimens, f"{key}bias", "... measured less predicted, mean", "%"))
         return tuple(rows), (Panel("travel [m]", "force [kN]", tuple(curves)),)
 
 
