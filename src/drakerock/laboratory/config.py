@@ -49,8 +49,8 @@ class ShearSettings(LabSettings):
 class DischargeSettings(LabSettings):
     """Rocks run out of a slot, and out of a hopper with a slot."""
 
-    rocks: Annotated[int, Field(ge=20, le=20_000, description="in each specimen")] = 500
-    openings: Annotated[Lengths, Field(min_length=3, description="of the slot [mean size]")] = (4.5, 5.5, 6.5)
+    rocks: Annotated[int, Field(ge=20, le=20_000, description="in each specimen")] = 1500
+    openings: Annotated[Lengths, Field(min_length=3, description="of the slot [mean size]")] = (5.5, 6.5, 7.5)
     hopper_angle_deg: Annotated[
         float, Field(ge=10, le=45, description="of the hopper's walls, to the vertical")
     ] = 30.0
