@@ -29,7 +29,6 @@ from drakerock.rocks.engine.compiling import announce_compilation
 from drakerock.rocks.engine.config import NonsmoothConfig
 from drakerock.rocks.engine.contact_cache import CacheIndex
 from drakerock.rocks.engine.contact_law import ContactLaw
-from drakerock.rocks.engine.memory_access import make_aligned_zeros
 from drakerock.rocks.engine.records import (
     BODY,
     FOLLOWED,
@@ -227,7 +226,7 @@ class NonsmoothEngine(RockSet):
             SiteBox(self.lower_site, self.upper_site),
             self.time_step,
         )
-        self._bodies = make_aligned_zeros((n + 1,), BODY)
+        self._bodies = np.zeros(n + 1, BODY)
         self._single_bodies = make_single_bodies(n + 1)
         # Zero between steps, for the rocks.
         self._velocities = np.zeros((n + 1 + self.n_machine_bodies, 6))

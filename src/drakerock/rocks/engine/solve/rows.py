@@ -16,7 +16,7 @@ from drakerock.rocks.engine.contact_law import (
     is_impact,
     update_impulse,
 )
-from drakerock.rocks.engine.memory_access import AHEAD, make_aligned_zeros
+from drakerock.rocks.engine.memory_access import AHEAD
 from drakerock.rocks.engine.records import BODY, CONTACT_ROW, as_matrix
 from drakerock.rocks.engine.solve.bodies import (
     add_mobility,
@@ -59,7 +59,7 @@ class ContactRows(NamedTuple):
 def make_contact_rows(capacity: int) -> ContactRows:
     """Return room for so many rows."""
     numbers = [np.zeros(capacity, np.int64) for _ in range(3)]
-    values = make_aligned_zeros((capacity,), CONTACT_ROW)
+    values = np.zeros(capacity, CONTACT_ROW)
     return ContactRows(values, as_matrix(values), *numbers)
 
 
